@@ -9,9 +9,9 @@ import gc
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 # Before numpy is imported: threads slow small matrices down.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
@@ -21,6 +21,9 @@ os.environ["NOACK_NO_EXTENSIONS"] = "1"  # their tests are beside them, in a run
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
+
+if TYPE_CHECKING:
+    from cosim.analysis.witnesses import Witnesses
 
 # The workers and the programs that tests start import the same modules hundreds of times.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -136,6 +139,19 @@ def without_viewer(no_recording: None, monkeypatch: pytest.MonkeyPatch) -> None:
 def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write pages whose figures are not drawn, which takes most of their time."""
     monkeypatch.setattr("cosim.output.page_kit.inline", lambda _: "<svg></svg>")
+
+
+@pytest.fixture
+def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """End searches for witnesses early, where it does not matter what is proven."""
+    from cosim.analysis.certificates import Certificates
+
+    prove = Certificates.prove
+
+    def shortly(self: Certificates, progress: Callable[[float], None] = lambda _: None) -> "Witnesses":
+        return prove(self, progress, most_work=0.02)
+
+    monkeypatch.setattr(Certificates, "prove", shortly)
 
 
 @pytest.fixture

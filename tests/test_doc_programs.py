@@ -39,9 +39,9 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 SHORTER = {
     "simulate": ("--no-report", "--set", "horizon_s=1"),
-    "demo": ("--no-report",),
-    "run": ("--no-report",),
-    "campaign": ("--workers", "1"),
+    "demo": ("--no-report", "--set", "certificate.prove=false"),
+    "run": ("--no-report", "--set", "certificate.prove=false"),
+    "campaign": ("--workers", "1", "--draws", "10"),
     "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
     "design": ("--draws", "80"),
     "margin": ("--no-period", "--most", "2"),
@@ -81,7 +81,7 @@ def snippets() -> list[str]:
     return [snippet for snippet in programs if not snippet.startswith("#")]
 
 
-@pytest.mark.usefixtures("without_viewer")
+@pytest.mark.usefixtures("without_viewer", "short_searches")
 @pytest.mark.parametrize("snippet", snippets())
 def test_every_snippet_runs(
     snippet: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch,
@@ -92,6 +92,7 @@ def test_every_snippet_runs(
     assert capsys.readouterr().out.strip()
 
 
+@pytest.mark.usefixtures("short_searches")
 @pytest.mark.parametrize("name", FIGURES)
 def test_an_example_runs_and_leaves_its_figures(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]

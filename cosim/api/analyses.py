@@ -23,7 +23,7 @@ def certify(
     """Return the certificates of a scenario, with their constants and conditions.
 
     >>> import noack
-    >>> certificates = noack.certify("lane_following")
+    >>> certificates = noack.certify("double_integrator")
     >>> certificates.schedule.constants is None  # there is one
     False
     >>> certificates.schedule.is_proven("state")  # the bound of ‖x‖

@@ -25,33 +25,6 @@ ByHand = Callable[[str], subprocess.Popen[str]]
 RECORD = ("record", "lane_following")
 
 
-def test_a_wait_for_a_missing_process_can_be_interrupted(
-    start: Start, by_hand: ByHand, tmp_path: Path
-) -> None:
-    recording = start(command=RECORD)
-    own = psutil.Process(recording.process.pid)
-    processes = {role: by_hand(role) for role in LOOP_ROLES if role != "netem"}
-    assert recording.process.stderr is not None
-    live.wait_for(lambda: recording.process.stderr.readline() == "waiting for netem\n")  # type: ignore[union-attr]
-    children = own.children(recursive=True)
-    recording.process.send_signal(signal.SIGINT)
-    stdout, stderr = live.wait_for_end(recording.process)
-    assert recording.process.returncode == 130
-    (line,) = stderr.splitlines()
-    assert line.startswith("noack: stopped by the user (SIGINT) (logs in ")
-    assert json.loads(stdout)["exit"]["status"] == 130
-    for role, process in processes.items():
-        _, stderr = live.wait_for_end(process)
-        assert process.returncode == 1
-        why = stderr.splitlines()[-1].removeprefix(f"noack {role}: ")
-        assert why in (
-            "stopped by the user (SIGINT)",
-            "the connection to `noack record` is lost",
-        ), stderr
-    assert psutil.wait_procs(children, timeout=live.PATIENCE_S)[1] == []
-    assert live.private_files(tmp_path) == []
-
-
 @pytest.mark.usefixtures("no_report", "no_recording")
 def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> None:
     """The loop reaches its horizon, and each process stores all of its rows itself."""

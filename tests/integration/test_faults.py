@@ -46,7 +46,7 @@ def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     assert running.left_behind() == []
 
 
-@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize("role", ["sensor", "netem", "recorder"])
 def test_a_killed_process_ends_the_run_and_no_recorded_row_is_lost(start: Start, role: str) -> None:
     """The rows of the others are complete; the killed one may not have handed over its last ones."""
     running = start(*LONG)
@@ -122,16 +122,6 @@ def run(runs: Path) -> list[str]:
 def is_whole(run_dir: Path) -> bool:
     steps = load_record(run_dir)["plant_step"]
     return np.array_equal(steps["sequence"], np.arange(HORIZON_S * live.RATE_HZ + 1))
-
-
-def test_a_run_with_closed_streams_is_complete(tmp_path: Path) -> None:
-    """Closed by a shell's ``<&- >&- 2>&-``: files opened next get the descriptors 0 to 2."""
-    shell = ["/bin/sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *run(tmp_path)]
-    environment = os.environ | live.WITHOUT_VIEWER
-    assert subprocess.run(shell, env=environment, timeout=live.PATIENCE_S).returncode == 0
-    run_dir = (tmp_path / "latest").resolve()
-    assert is_whole(run_dir)
-    assert {log.read_text() for log in (run_dir / "logs").iterdir()} == {""}
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="sets the size of a pipe")

@@ -16,7 +16,7 @@ from tests.cosim.output.viewer.recordings import read
 from tests.helpers import live_runs as live
 from tests.helpers.waiting import is_left
 
-DISTURBED_S = 36.0
+DISTURBED_S = 18.0
 PAUSE_S = 0.7
 """Well below zenoh's lease, and far above every delay that a certificate allows."""
 SILENT_S = 3.0
@@ -59,7 +59,7 @@ def disturbed_run(folder: Path) -> Disturbed:
     with pytest.MonkeyPatch.context() as environment, live.start_runs(folder) as start:
         for name in [name for name in os.environ if "DISPLAY" in name]:
             environment.delenv(name)  # the viewer opens in a browser
-        values = live.settings(speed=4.0, horizon_s=DISTURBED_S)
+        values = live.settings(speed=2.0, horizon_s=DISTURBED_S)
         running = start(*live.AT_RATE, *values, "--live", viewer=True)
         running.wait_recording()
         viewers = viewers_of(running)

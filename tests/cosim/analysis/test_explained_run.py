@@ -21,7 +21,7 @@ from tests.helpers.shipped import resolved, shipped
 Change = Callable[[Mapping[str, Rows]], None]
 _SINE = "{kind='sine',at='state',amplitude=[0.0,0.0,0.1,0.1],hz=2.0}"
 _SETTINGS = (
-    "horizon_s=3", "trigger.beta=0.02",
+    "horizon_s=1.6", "trigger.beta=0.01",
     "network.actuation={loss={model='bernoulli',probability=0.3},mansd=2}",
     "controller.predictions=3", "network.impairments=[{kind='delay',delay_s=0.004,jitter_s=0.003}]",
     f"plant.disturbances=[{{kind='uniform',bound=[0.01,0.01]}},{_SINE}]",
@@ -112,7 +112,7 @@ def test_the_record_itself_is_explained() -> None:
         "plant.rate_hz=499",
         "plant.measure_every=2",
         f"plant.disturbances=[{{kind='uniform',bound=[0.001,0.001]}},{_SINE}]",
-        "trigger.beta=0.0202",
+        "trigger.beta=0.0101",
         "trigger.alpha_per_s=0.26",
         "trigger.weight=[[1.01,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]",
         "network.mansd=3",

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.analysis import margin_search
-from cosim.analysis.margin_search import find_longest_period, find_margin, undecided_text
+from cosim.analysis.margin_search import find_longest_period, find_margin
 from cosim.cli.options import load_scenario
 from noack.core.linear_systems import discretise
 from noack.scenario.resolution import loop_of, resolve
@@ -69,27 +68,6 @@ def test_verdicts_agree_with_the_bounds() -> None:
     assert f"M ≤ {margin.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(margin)
 
 
-def test_no_longest_time_between_updates_is_below_the_least_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """There the loop is examined with equal times only, not with all up to the longest one."""
-    unstable = Stability(1.1, 1.2, (True,), (0.2,), 0)
-    monkeypatch.setattr(LossMargin, "coarse_bounds", lambda _: unstable)
-    rule = {"policy": "dwell", "interval_s": 0.2, "rule": {"policy": "absolute", "delta": 0.1}}
-    trigger = {"policy": "deadline", "interval_s": 0.8, "rule": rule}
-    scenario = noack.load("double_integrator", {"trigger": trigger, "plant.measure_every": 10})
-    limit = find_longest_period(resolve(scenario))
-    assert limit.is_longest
-    assert limit.stable_s is None
-    assert limit.unstable_s == pytest.approx(0.2)
-
-
-def test_a_bound_of_one_m_holds_for_the_others_that_it_implies(monkeypatch: pytest.MonkeyPatch) -> None:
-    bounds = (0.5, 0.9), (0.7, 0.95), (0.6, 0.8)
-    stabilities = iter([Stability(lower, upper, (True,), (1.0,), 0) for lower, upper in bounds])
-    monkeypatch.setattr(LossMargin, "stability", lambda *_, **__: next(stabilities))
-    margin = find_margin(resolve(held_integrator()), most_m=3, with_period=False)
-    assert [cap.stability[:2] for cap in margin.caps] == [(0.5, 0.8), (0.7, 0.8), (0.7, 0.8)]
-
-
 def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:
     constraints = [{"kind": "at_most", "losses": 1, "window": 4}]
     settings = {"network.constraints": constraints, "network.mansd": 5}
@@ -100,20 +78,6 @@ def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:
     assert margin.to_json()["period"] is None
     with pytest.raises(noack.NoackError, match="most 0: expected at least 1"):
         noack.margin("lane_periodic", most_m=0)
-
-
-@pytest.mark.parametrize(("lower", "verdict"), [(1.1, "destabilises M = 2"), (0.9, "M = 2 is undecided")])
-def test_what_constraints_allow_with_every_m_is_stable_only_if_their_longest_burst_is(
-    lower: float, verdict: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    longest = Stability(lower, 1.2, (True, False), (1.0, 1.0), 0)
-    found = iter([Stability(0.5, 0.8, (True,), (1.0,), 0), longest])
-    monkeypatch.setattr(LossMargin, "stability", lambda *_, **__: next(found))
-    constraints = [{"kind": "at_most", "losses": 1, "window": 4}]
-    margin = find_margin(resolve(held_integrator(**{"network.constraints": constraints})), with_period=False)
-    assert margin.every_m
-    assert margin.verdict.startswith("proven stable for every loss pattern with M ≤ 1;")
-    assert verdict in margin.verdict
 
 
 def test_a_loop_with_events_has_a_margin_for_all_times_between_them() -> None:
@@ -128,13 +92,6 @@ def test_a_loop_with_events_has_a_margin_for_all_times_between_them() -> None:
     assert "with updates 0.2 to 0.8 s apart" in " ".join(result.output.split())
     words = ["margin", "lane_periodic", "--no-period", "--most", "2"]
     assert "proven stable for every loss pattern with M ≤ 2" in invoke(*words).output
-
-
-def test_a_loop_that_no_m_stabilises_fails_and_a_pattern_without_times_is_not_played() -> None:
-    result = invoke("margin", "lane_periodic", "--set", "trigger.period_s=9", "--no-period")
-    assert (result.exit_code, "destabilises M = 1" in result.output) == (1, True), result.output
-    result = invoke("margin", "double_integrator", *DEADLINE, "--play", "--no-period")
-    assert (result.exit_code, "--play: the times between" in result.stderr) == (2, True), result.output
 
 
 def test_the_played_settings_are_the_pattern() -> None:
@@ -170,15 +127,6 @@ def test_stronger_and_weaker_guarantees_are_compared_with_the_scenarios() -> Non
     assert first in printed
 
 
-def test_an_undecided_m_states_the_gap_and_the_effort() -> None:
-    bounds = Stability(0.99, 1.01, (True,), (0.5,), 0, 30.0, took_s=4.0)
-    text = undecided_text(bounds, effort=2.0)
-    assert "growth between 0.99 and 1.01, gap 0.02" in text
-    assert "--effort 30 is estimated to prove it, in about 60 s" in text
-    never = bounds._replace(needed_effort=np.inf)
-    assert "no effort up to 1e+06" in undecided_text(never, effort=1.0)
-
-
 @pytest.mark.usefixtures("usual_signals")
 @pytest.mark.parametrize("json_output", [False, True])
 def test_ctrl_c_leaves_what_was_decided(monkeypatch: pytest.MonkeyPatch, json_output: bool) -> None:
@@ -204,25 +152,3 @@ def test_ctrl_c_leaves_what_was_decided(monkeypatch: pytest.MonkeyPatch, json_ou
         assert document["period"] is None
     else:
         assert "proven stable for every loss pattern with M ≤ 2" in result.stdout
-
-
-@pytest.mark.usefixtures("usual_signals")
-def test_ctrl_c_in_the_search_of_a_period_leaves_every_m(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        margin_search, "find_longest_period", lambda *arguments: signal.raise_signal(signal.SIGINT)
-    )
-    result = invoke("margin", "lane_periodic", "--most", "2")
-    missing = "the longest period, random losses, the certificate"
-    line = f"noack: stopped by the user (SIGINT); missing: {missing}"
-    assert (result.exit_code, result.stderr.splitlines()[-1]) == (130, line)
-    assert "M ≤ 2" in result.stdout
-
-
-@pytest.mark.usefixtures("usual_signals")
-def test_ctrl_c_before_the_first_decision_prints_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        LossMargin, "stability", lambda *arguments, **more: signal.raise_signal(signal.SIGINT)
-    )
-    result = invoke("margin", "lane_periodic")
-    assert (result.exit_code, result.stdout) == (130, "")
-    assert result.stderr.splitlines()[-1] == "noack: stopped by the user (SIGINT)"

@@ -38,13 +38,3 @@ def test_the_controller_has_no_state_before_its_first_update() -> None:
     assert np.isfinite(x_c.values[1:]).all()
     known = noack.with_settings(scenario, {"network.initial_sync": "known_state"})
     assert np.isfinite(curves_of(noack.simulate_exactly(known), "x_c controller")[0].values).all()
-
-
-@pytest.mark.parametrize(("scenario", "reason"), [
-    ("shared_channel", "this is for one"),
-    ("lane_5g_urban", "has no delay"),
-    ("dc_motor", "the plant is not given by matrices A and B"),
-])  # fmt: skip
-def test_what_the_exact_simulation_does_not_cover_is_refused(scenario: str, reason: str) -> None:
-    with pytest.raises(noack.NoackError, match=reason):
-        noack.simulate_exactly(scenario)

@@ -47,15 +47,6 @@ def test_the_estimates_are_those_of_the_draws(result: noack.CampaignResult) -> N
     assert result.breaches == 0
 
 
-def test_the_page_the_summary_and_the_figures_are_there(result: noack.CampaignResult) -> None:
-    assert result.report().is_file()
-    document = json.loads((result.folder / "summary.json").read_text())
-    assert [row["axes"] for row in document["points"]] == [row["axes"] for row in result.summary["points"]]
-    assert result.plot().axes
-    assert "0.8" in repr(result)
-    assert "<table>" in result._repr_html_()
-
-
 def test_numbers_may_be_those_of_numpy(result: noack.CampaignResult) -> None:
     axes = [PLAN["axes"][0], PLAN["axes"][1] | {"values": np.array([0.2, 0.8])}]
     plan = PLAN | {"axes": axes, "settings": {"horizon_s": np.float32(5)}, "draws": np.int64(30)}
@@ -69,15 +60,6 @@ def test_numbers_may_be_those_of_numpy(result: noack.CampaignResult) -> None:
     assert first == same
 
 
-def test_what_is_not_there_is_named(result: noack.CampaignResult) -> None:
-    with pytest.raises(noack.NoackError, match=r"loss is one of 0\.2, 0\.8"):
-        result.draws(mode="model", loss=0.3)
-    with pytest.raises(noack.NoackError, match="it has curve-1"):
-        result.plot("curve-2")
-    with pytest.raises(noack.NoackError, match="campaign: axes"):
-        noack.campaign({**PLAN, "axes": []})
-
-
 def test_a_system_is_certified(scenario: noack.Scenario) -> None:
     certificates = noack.certify(scenario)
     assert pickle.loads(pickle.dumps(certificates)).to_json() == certificates.to_json()
@@ -85,14 +67,3 @@ def test_a_system_is_certified(scenario: noack.Scenario) -> None:
     assert json.loads(json.dumps(certificates.to_json()))["scenario"] == "own_system"
     assert certificates.schedule.is_proven("state")
     assert not noack.certify(scenario, proofs=False).schedule.is_proven("state")
-
-
-def test_the_box_is_certified_and_shown(scenario: noack.Scenario) -> None:
-    box = {"plant.uncertainty_A": [[0.0, 0.0], [0.3, 0.1]]}
-    certificates = noack.certify(noack.with_settings(scenario, box), late=0, proofs=False)
-    assert certificates.paper_box is not None
-    assert certificates.schedule_box is not None
-    assert certificates.paper_box.constants is not None
-    for text in (repr(certificates), certificates._repr_html_()):
-        assert "schedule, box" in text
-        assert f"{certificates.paper_box.constants.delta:.4g}" in text

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -55,20 +54,6 @@ def test_a_run_of_several_loops_has_each_loop_as_a_run() -> None:
         run.samples()
 
 
-def test_a_run_is_replayed_compared_and_plotted(simulated: noack.Run) -> None:
-    assert simulated.replay().bit_exact
-    assert simulated.plot("losses")._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
-
-
-def test_mistakes_give_one_line(simulated: noack.Run, tmp_path: Path) -> None:
-    with pytest.raises(noack.NoackError, match="not a run directory"):
-        noack.open_run(tmp_path)
-    with pytest.raises(noack.NoackError, match=r'"lateness": no such figure .* it has states, '):
-        simulated.plot("lateness")
-    with pytest.raises(noack.NoackError, match='"plant": the record has no such table; it has'):
-        simulated.table("plant")
-
-
 def test_a_temporary_run_exists_as_long_as_its_object() -> None:
     run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.1}))
     folder = run.directory
@@ -113,11 +98,6 @@ def test_an_interrupted_live_run_is_returned() -> None:
     assert process.returncode == 0
 
 
-def test_a_live_run_needs_the_main_thread(scenario: noack.Scenario) -> None:
-    with ThreadPoolExecutor() as pool, pytest.raises(noack.NoackError, match="main thread"):
-        pool.submit(noack.run, scenario).result()
-
-
 def test_a_table_is_the_file_with_a_column_of_seconds_first(simulated: noack.Run) -> None:
     assert "plant_step" in simulated.tables
     for name in simulated.tables:
@@ -151,11 +131,3 @@ def test_event_counts_agree_with_the_summary(simulated: noack.Run) -> None:
     intervals_s = events["interval_s"].to_numpy()
     assert np.isnan(intervals_s[0])
     assert intervals_s[1:].min() == pytest.approx(summary.inter_event_min_s)
-
-
-def test_a_damaged_table_gives_one_line(scenario: noack.Scenario) -> None:
-    run = noack.simulate(noack.with_settings(scenario, {"horizon_s": 0.1}))
-    assert run.tables
-    (run.directory / "record/plant_step.parquet").write_bytes(b"PAR1")
-    with pytest.raises(noack.NoackError, match=r"plant_step\.parquet: cannot be read"):
-        run.table("plant_step")

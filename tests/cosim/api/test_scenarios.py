@@ -1,6 +1,5 @@
 """Scenarios from files, tables and matrices, and the messages for mistakes."""
 
-from pathlib import Path
 from typing import Any
 
 import control
@@ -9,15 +8,6 @@ import pytest
 
 import noack
 from tests.cosim.api.conftest import GAIN, SYSTEM, TRUE
-
-
-def test_files_are_found_relative_to_the_scenario(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: dict[str, Any]
-) -> None:
-    np.savez(tmp_path / "model.npz", A=SYSTEM[0], B=SYSTEM[1], K=GAIN)
-    content["model"] = {"file": "model.npz"}
-    monkeypatch.chdir(tmp_path)
-    assert noack.load(content).model.matrices[0].tolist() == SYSTEM[0]
 
 
 @pytest.mark.parametrize(
@@ -61,19 +51,3 @@ def test_a_python_control_system_keeps_its_names_and_may_have_another_plant() ->
     assert scenario.model.state_names == ("angle", "rate")
     assert np.array(scenario.plant.A).tolist() == TRUE[0]
     assert (scenario.name, scenario.decaying.beta) == ("own", 0.01)
-
-
-@pytest.mark.parametrize(
-    ("gain", "initial_state", "message"),
-    [
-        ([[15.0, 5.0]], [0.2, 0.0], "give -K"),
-        ([[0.0, 0.0]], [0.2, 0.0], "has an eigenvalue with real part 3.08 /s; give a gain"),
-        (GAIN, [0.2], "plant.initial_state"),
-        (GAIN, "upright", "plant.initial_state"),
-    ],
-)
-def test_an_invalid_system_gives_one_line(gain: Any, initial_state: Any, message: str) -> None:
-    with pytest.raises(noack.NoackError) as error:
-        noack.from_system(SYSTEM, gain, initial_state)
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)

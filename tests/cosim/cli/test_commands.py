@@ -2,42 +2,15 @@
 
 import json
 import signal
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
-import tomli_w
 
 from cosim.cli import options
 from cosim.live import finalize
 from cosim.record.run_directory import SUMMARY_FILE
 from tests.helpers.command_line import invoke
-
-
-def test_check_prints_the_defaults_that_depend_on_other_keys(tmp_path: Path, content: dict[str, Any]) -> None:
-    path = tmp_path / "small.toml"
-
-    def message() -> str:
-        path.write_text(tomli_w.dumps(content))
-        result = invoke("check", path)
-        assert result.exit_code == 0, result.stderr
-        assert result.stderr == ""
-        assert tomllib.loads(result.stdout)["name"] == content["name"]
-        return " ".join(result.stdout.replace("\n# ", "\n").split())
-
-    silent = message()
-    assert "watchdog: policy hold" in silent
-    content["plant"]["watchdog"] = {"timeout_s": 0.2}
-    assert "timeout_input: no effect" not in silent
-    content["controller"] = {"safe_input": [0.1], "timeout_input": "hold"}
-    content["start_within_s"] = 60.0
-    content["trigger"] = {"policy": "periodic", "period_s": 0.0031}
-    explicit = message()
-    assert "trigger.period_s: updates are sent at measurements, every 0.004 s" in explicit
-    assert "timeout_input: no effect without controller.update_timeout_s" in explicit
-    assert not any(key in explicit for key in ("watchdog:", "safe_input:", "_within_s:"))
-
 
 INTERRUPTED = "noack: stopped by the user (SIGINT)\n"
 

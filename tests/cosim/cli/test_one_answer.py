@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 import noack
-from cosim.analysis.certificates import answer_for
 from cosim.cli.options import load_scenario
 from cosim.cli.played_pattern import GROWN, until_it_shows
 from cosim.output.result_tables import Tone
@@ -50,23 +49,6 @@ def test_the_answer_of_certify_is_that_of_margin(period_s: float, losses: int) -
     assert str(margin).splitlines()[-1] == (
         f"noack certify --no-proofs, for at most M − 1 = {losses} consecutive losses: {answer.text}"
     )
-
-
-def test_a_setting_that_no_certificate_covers_is_the_reason_once() -> None:
-    answer = answer_for(noack.load("model_predictive"))
-    assert not answer.is_certified
-    assert answer.text == 'no certificate: controller.kind = "python": u is not K x_c'
-
-
-def test_what_is_violated_without_a_certificate_is_its_condition() -> None:
-    shown = " ".join(invoke("certify", "lane_periodic", "--no-proofs", "--verbose").stdout.split())
-    assert "violated small-gain condition (certificate): the loop gain of the errors is 1e+04" in shown
-    shown = " ".join(invoke("certify", "cart_pole", "--no-proofs", "--verbose").stdout.split())
-    assert (
-        "violated condition of the certificate (certificate): the bounds from x(0) need the region" in shown
-    )
-    assert "there is a certificate" not in shown
-    assert "box is too large" not in shown
 
 
 def test_a_played_pattern_is_long_enough_to_show_its_growth(tmp_path: Path) -> None:

@@ -75,14 +75,6 @@ def test_a_run_exits_with_1_unless_its_verdict_has_what_is_required(
         assert line.startswith(f"noack: --require {start}")
 
 
-def test_an_exact_run_can_be_required_to_be_stable_and_no_more() -> None:
-    command = ("simulate", "lane_following", "--trigger", "continuous", "--json")
-    assert invoke(*command, "--require", "stable").exit_code == 0
-    assert invoke(*command, "--set", "horizon_s=1", "--require", "stable").exit_code == 1
-    result = invoke(*command, "--require", "guarantee")
-    assert (result.exit_code, result.stdout[:11]) == (2, '{\n  "error"')
-
-
 @pytest.mark.parametrize(
     ("claims", "unmet"),
     [

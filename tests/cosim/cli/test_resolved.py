@@ -1,6 +1,5 @@
 """``noack check --resolved``: a scenario file of the same run, in numbers only."""
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -47,22 +46,3 @@ def test_output_is_a_scenario_of_the_same_run(name: str, tmp_path: Path) -> None
     first, second = short_run(loop), short_run(again)
     for table in (PLANT_STEP, SENSOR_MEASUREMENT, NETEM_PACKET, CONTROLLER_STEP):
         np.testing.assert_array_equal(first[table], second[table])
-
-
-def test_output_has_numbers_for_times_that_follow_from_other_keys() -> None:
-    delayed = 'network.impairments=[{kind="delay", delay_s=0.02, jitter_s=0.003}]'
-    content = tomllib.loads(printed("lane_following", "--set", delayed))
-    assert content["certificate"]["network_delay_s"] == pytest.approx(0.023)
-    assert content["plant"]["watchdog"]["timeout_s"] == pytest.approx(0.1)
-    assert content["plant"]["draw"] == "given"
-
-
-def test_delay_in_a_queue_stays_unknown() -> None:
-    queue = 'network.impairments=[{kind="rate", rate_bps=1000000}]'
-    assert "network_delay_s" not in tomllib.loads(printed("lane_following", "--set", queue))["certificate"]
-
-
-def test_one_of_several_loops_is_named() -> None:
-    result = invoke("check", "shared_channel", "--resolved")
-    assert result.exit_code != 0
-    assert "--loop NAME" in result.output

@@ -1,8 +1,6 @@
 """`noack set`: its arguments, and the run that it applies to."""
 
-import json
 import stat
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +9,14 @@ import tomli_w
 
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.cli.live_settings import parse_settings
-from cosim.live.coordination.coordinator import Coordinator
 from noack.core.errors import CallerError
 from noack.runtime import active_runs
-from noack.runtime.active_runs import OpenRun
-from noack.runtime.control_messages import ChangeReply
 from noack.runtime.run_descriptor import RunDescriptor, new_access, new_descriptor
 from noack.scenario.parameter_changes import changed
-from noack.scenario.resolution import ResolvedRun, resolve
+from noack.scenario.resolution import resolve
 from noack.scenario.runtime_parameters import SHORT
 from noack.scenario.scenario_file import load, validate
-from tests.fuzz.plane import Query
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.helpers.command_line import invoke
 
 
 @pytest.fixture
@@ -31,15 +24,6 @@ def descriptor(content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     scenario = resolve(validate(content, "here"))
     return new_descriptor(new_access(tmp_path / "run", launched=True), scenario)
-
-
-@pytest.fixture
-def coordinator(descriptor: RunDescriptor) -> Iterator[Coordinator]:
-    running = Coordinator(descriptor, ResolvedRun(descriptor.scenario))
-    try:
-        yield running
-    finally:
-        running.close()
 
 
 VALUES = {
@@ -104,30 +88,3 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
         with pytest.raises(CallerError, match="probability = nan: expected a finite number"):
             active_runs.request_change(active_runs.find_run(session="lab"), parse_settings(["loss.p", "nan"]))
     assert list(path.parent.iterdir()) == []
-
-
-def test_only_active_runs_can_be_changed(coordinator: Coordinator) -> None:
-    result = invoke("set", "loss.p", "0.5")
-    assert result.exit_code == 2
-    assert "no run is active" in result.stderr
-    with pytest.raises(CallerError, match=r"the run runs/ended is not active, and no run is active"):
-        active_runs.find_run(run_dir=Path("runs/ended"))
-    change = Query("", b'{"settings": {"network.mansd": 1}}')
-    question = Query("", b"{}")
-    coordinator._answer_change(change)  # type: ignore[arg-type]
-    assert change.error == "the run has not started"
-    coordinator._answer_change(question)  # type: ignore[arg-type]
-    runtime_parameters = json.loads(question.replies[0])["runtime_parameters"]
-    assert runtime_parameters["network.mansd"] == 2
-    assert runtime_parameters["controller.setpoint"] == [0.0, 0.0]
-
-
-def test_settings_that_are_in_force_already_are_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
-    reply = ChangeReply(
-        name="lane", run_dir="runs/one", t_s=1.0, from_s=None, runtime_parameters={}, loops={"lane": {}},
-        changed_loops=(), warnings=(), thresholds={},
-    )  # fmt: skip
-    monkeypatch.setattr(active_runs, "find_run", lambda *of: OpenRun("1", "runs/one", None))
-    monkeypatch.setattr(active_runs, "request_change", lambda run, changes: reply)
-    result = invoke("set", "mansd", "2")
-    assert result.stdout == "lane: unchanged, already in force: network.mansd = 2\n"

@@ -42,36 +42,6 @@ def test_a_shipped_scenario_runs_from_the_command_line_and_in_the_library(name: 
     assert json.loads(simulated.stdout)["exit"]["status"] == 0
 
 
-@pytest.mark.usefixtures("no_drawing")
-def test_each_command_runs_a_trigger_of_ones_own_or_says_why_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """``lane_python_trigger``: its trigger is a class, so it has no rule, bound or exact run."""
-    monkeypatch.chdir(tmp_path)
-    own_trigger, last = "lane_python_trigger", "runs/latest"
-    Path("own.toml").write_text(
-        f'name = "own"\nscenario = "{own_trigger}"\ndraws = 2\n'
-        'axes = [{ name = "loss", key = "network.loss.probability", values = [0.2, 0.8] }]\n'
-        'figures = [{ kind = "curve", x = "loss", metric = "transmissions" }]\n'
-    )
-    works = (
-        f"simulate {own_trigger} --set horizon_s=1",
-        f"summary {last} --verbose", f"replay {last}", f"report {last}", f"compare {last} {last}",
-        f"export {last} --format csv",
-    )  # fmt: skip
-    for line in works:
-        result = invoke(*line.split())
-        assert result.exit_code == 0, result.output
-    refuses = (  # the others are in mistakes.txt
-        ("campaign own.toml", 'time = "sampled" runs it as `noack simulate` does'),
-    )
-    for line, reason in refuses:
-        result = invoke(*line.split())
-        assert result.exit_code == 2, result.output
-        assert reason in result.stderr
-        assert result.stderr.count("\n") == 1
-
-
 def test_all_shipped_scenarios_are_listed_with_their_description() -> None:
     document = json.loads(invoke("scenarios", "--json").stdout)
     assert [entry["name"] for entry in document["scenarios"]] == SCENARIOS

@@ -1,14 +1,11 @@
 """``noack certify`` on every shipped scenario, from the command line, with searches that end early."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import noack
-from cosim.analysis.certificates import Certificates
-from cosim.analysis.witnesses import Witnesses
 from noack.core.errors import ExitStatus
 from noack.scenario.scenario import loop_names
 from tests.helpers.command_line import invoke
@@ -16,17 +13,19 @@ from tests.helpers.command_line import invoke
 FILES = (Path(__file__).parents[3] / "scenarios").glob("*.toml")
 LIKE_OTHERS = {"lane_5g_arterial", "lane_5g_rural", "lane_weighted"}
 """Other numbers of scenarios that are tried."""
-SCENARIOS = sorted({file.stem for file in FILES} - LIKE_OTHERS)
+LONG = {
+    "different_loops", "f16_lateral", "kinematic_car", "lane_5g_urban", "lane_constrained", "lane_crosswind",
+    "lane_periodic", "shared_channel", "sine_pendulum",
+}  # fmt: skip
+"""Scenarios that take seconds each, also without a search."""
+SCENARIOS = [
+    pytest.param(name, marks=pytest.mark.system if name in LONG else ())
+    for name in sorted({file.stem for file in FILES} - LIKE_OTHERS)
+]
 
 
-@pytest.fixture
-def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
-    prove = Certificates.prove
-
-    def shortly(self: Certificates, progress: Callable[[float], None]) -> Witnesses:
-        return prove(self, progress, most_work=0.2)
-
-    monkeypatch.setattr(Certificates, "prove", shortly)
+@pytest.fixture(autouse=True)
+def no_chosen_norm(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cosim.analysis.certificates.in_chosen_norm", lambda *_: None)
 
 

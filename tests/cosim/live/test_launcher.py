@@ -14,12 +14,11 @@ from cosim.live.launcher import _Run, launch
 from cosim.live.monitoring.run_observers import RunObserver, RunObservers
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
 from cosim.live.processes.early_certificates import EarlyCertificates
-from noack.core.errors import CallerError, ExitStatus
+from noack.core.errors import ExitStatus
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime import command_line
 from noack.runtime.command_line import Signals, StopRequestError
-from noack.runtime.run_descriptor import descriptor_file, new_access, new_descriptor
-from noack.scenario.resolution import resolve, resolve_run
+from noack.scenario.resolution import resolve_run
 from noack.scenario.scenario_file import validate
 from tests.helpers.waiting import wait_for
 
@@ -150,42 +149,6 @@ def test_a_run_that_does_not_end_names_the_late_process(
     )
 
 
-@pytest.mark.parametrize(
-    ("missing", "reason"),
-    [
-        (("plant",), "plant did not join in time: waited 90 s (start_within_s); start with `noack plant`"),
-        (
-            ("plant", "netem"),
-            "plant, netem did not join in time: waited 90 s (start_within_s); start with `noack plant`, "
-            "`noack netem`",
-        ),
-        ((RECORDER,), "recorder was not ready in time: waited 90 s; likely cause: a load of "),
-    ],
-)
-def test_of_a_process_that_nobody_starts_the_load_is_not_the_cause(
-    case: Case, missing: tuple[str, ...], reason: str
-) -> None:
-    """On a loaded machine, `noack record` said that the load was the likely cause."""
-    coordinator = FakeCoordinator(0.0)
-    vars(coordinator).update(epoch_ns=None, missing=lambda: missing)
-    children = case.children(None)
-    children._children = {RECORDER: children._children[RECORDER]}
-    run = case.run(children, coordinator)
-    run._limit.wait(90.0, 1e3)
-    assert run._overdue().startswith(reason)
-
-
-def test_the_reason_for_an_end_by_sighup_is_not_another_signal(case: Case) -> None:
-    """Its exit status is that of SIGTERM."""
-    failures = case.children(143).failures(lambda role: "SIGHUP")
-    assert failures == {"sensor": (ExitStatus.FAILED, "sensor ended early: SIGHUP")}
-    case.log.unlink()
-    failures = case.children(3).failures(lambda role: None)
-    assert failures == {"sensor": (ExitStatus.FAILED, "sensor ended with exit status 3")}
-    failures = case.children(143).failures(lambda role: None)
-    assert failures == {"sensor": (ExitStatus.FAILED, "sensor ended early: SIGTERM")}
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="the state of a process is in /proc")
 @pytest.mark.parametrize("now_s", [0.5, 2.0], ids=["within the run", "after the horizon"])
 def test_a_stopped_process_is_named_with_its_state(
@@ -249,17 +212,6 @@ def test_why_a_run_ends_early_is_shown_before_its_processes_end(case: Case) -> N
     status, reason = run.watch(Signals(), lambda *_: None)
     assert calls == [reason, {"warnings": ["late"]}]
     assert (status, reason) == (ExitStatus.FAILED, "plant died: killed by SIGKILL")
-
-
-def test_a_refused_session_leaves_no_run_directory(
-    content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    scenario = validate(content | {"ports": {}}, "")
-    descriptor = new_descriptor(new_access(tmp_path, launched=False), resolve(scenario))
-    with descriptor_file(descriptor, "lab"), pytest.raises(CallerError, match="another run is open in it"):
-        launch(scenario, tmp_path / "runs", spawn=(), session="lab")
-    assert list((tmp_path / "runs").iterdir()) == []
 
 
 def test_after_a_second_signal_the_record_is_incomplete_and_can_be_completed(

@@ -24,9 +24,3 @@ def test_the_time_to_start_grows_with_the_load(load: float, times: int, reason: 
     limit = WaitLimit(30.0, 2)
     assert reached_after_s(limit, load) == pytest.approx(30.0 * times, abs=0.25)
     assert reason in limit.explain_start(["plant"])
-
-
-def test_the_reasons_are_sentences_about_the_processes() -> None:
-    limit = WaitLimit(30.0, 2)
-    assert limit.explain_start(["plant"]).startswith("plant was not ready in time: ")
-    assert limit.explain_start(["plant", "sensor"]).startswith("plant, sensor were not ready in time: ")

@@ -1,7 +1,6 @@
 """Comparison of runs: numbers, settings, distance, one figure; and runs that cannot be compared."""
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -113,35 +112,3 @@ def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: 
     for words, message in mistakes.items():
         result = compare(*words)
         assert (result.exit_code, result.stderr, result.stdout) == (2, message, "")
-
-
-def test_a_diverged_run_is_overlaid_up_to_its_end(runs: list[Path], tmp_path: Path) -> None:
-    comparison = compare_runs(runs[:2])
-    comparison.runs[1].record[PLANT_STEP]["x"][700:] = np.nan
-    assert all(key_number.name != "distance in x to A, RMS" for key_number in comparison.numbers)
-    comparison.save(tmp_path / "a.png")
-    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("words", [["compare", "{other}", "{run}"], ["export", "{other}", "--format", "csv"]])
-def test_a_summary_of_another_run_costs_one_line(runs: list[Path], tmp_path: Path, words: list[str]) -> None:
-    other = tmp_path / "other"
-    shutil.copytree(runs[0], other)
-    summary = json.loads((other / "summary.json").read_text())
-    summary["loops"][0]["name"] = "of_another_run"
-    (other / "summary.json").write_text(json.dumps(summary))
-    result = invoke(*(word.format(other=other, run=runs[0]) for word in words))
-    assert result.exit_code == 2
-    (line,) = result.stderr.splitlines()
-    assert "summary.json: has no loop lane_following, but of_another_run; if it is of another run" in line
-
-
-def test_a_report_from_a_summary_of_more_loops_costs_one_line(runs: list[Path], tmp_path: Path) -> None:
-    other = tmp_path / "other"
-    shutil.copytree(runs[0], other)
-    summary = json.loads((other / "summary.json").read_text())
-    summary["loops"][0]["number"] = 7
-    (other / "summary.json").write_text(json.dumps(summary))
-    result = invoke("report", other)
-    assert result.exit_code == 2
-    assert "summary.json: has loop 7, and the run has 1; if it is of another run" in result.stderr

@@ -1,13 +1,10 @@
 """``noack adversary``: the search that a policy gets, and a bound of zero."""
 
 import json
-import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from cosim.analysis import adversary
 from noack.core.errors import ExitStatus
 from tests.helpers.command_line import invoke
 
@@ -49,35 +46,3 @@ def test_a_bound_of_zero_is_searched(start: str) -> None:
     assert result.exit_code == ExitStatus.OK, result.output
     for worst in json.loads(result.stdout)["worst"].values():
         assert worst["tightness"] is None or worst["tightness"] <= 1 + 1e-9
-
-
-@pytest.mark.usefixtures("usual_signals")
-def test_ctrl_c_leaves_the_finished_objectives(monkeypatch: pytest.MonkeyPatch) -> None:
-    find_worst = adversary.find_worst
-
-    def interrupted(resolved: Any, aim: adversary.Objective, **settings: Any) -> Any:
-        if aim is adversary.Objective.COST:
-            signal.raise_signal(signal.SIGINT)
-        return find_worst(resolved, aim, **settings)
-
-    monkeypatch.setattr(adversary, "find_worst", interrupted)
-    arguments = ["--horizon", "0.5", "--nodes", "100", "--beam", "0"]
-    result = invoke("adversary", "double_integrator", *arguments, "--json")
-    assert list(json.loads(result.stdout)["worst"]) == ["error", "state"]
-    line = "noack: stopped by the user (SIGINT); missing: cost, inter-event"
-    assert (result.exit_code, result.stderr.splitlines()[-1]) == (130, line)
-    assert "state: " in invoke("adversary", "double_integrator", *arguments).stdout
-
-
-def test_the_policy_of_the_watchdog_makes_no_difference() -> None:
-    """Nothing is late in a search, so it never acts; "model" needs x_c in the actuations otherwise."""
-    arguments = ["--horizon", "0.5", "--nodes", "100", "--json", "--set"]
-    results = [
-        invoke("adversary", "double_integrator", *arguments, f'plant.watchdog={{policy="{policy}"}}')
-        for policy in ("hold", "model")
-    ]
-    assert [result.exit_code for result in results] == [ExitStatus.OK] * 2, results[1].output
-    held, modelled = (json.loads(result.stdout)["worst"] for result in results)
-    for objective, worst in held.items():
-        for key in ("value", "pattern", "tightness"):
-            assert modelled[objective].get(key) == worst.get(key)

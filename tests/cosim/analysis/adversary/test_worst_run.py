@@ -1,18 +1,15 @@
 """The worst run as values: its share of a certificate's bound, and that bound at the same time."""
 
-import math
 from dataclasses import replace
-from io import StringIO
 
 import numpy as np
 import pytest
-from rich.console import Console
 from scipy.integrate import quad
 
 from cosim.analysis.adversary.loop_flows import Objective, ObjectiveValue, measure_of
-from cosim.analysis.adversary.worst_run import WorstRun, certified_value, print_worst, reported_value
+from cosim.analysis.adversary.worst_run import WorstRun, certified_value
 from cosim.simulation.continuous import continuous_loop_of
-from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
+from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from tests.helpers.shipped import resolved
 
@@ -42,20 +39,6 @@ def test_a_run_beyond_the_bound_refutes_the_certificate(
     assert worst.breaches is breaches
 
 
-def test_an_infinite_value_is_null_in_json() -> None:
-    diverged = replace(WORST, value=math.inf)
-    assert diverged.diverges
-    content = diverged.to_json()
-    assert (content["value"], content["diverges"]) == (None, True)
-    assert (content["pattern"], content["delivered"]) == ("DL", [0])
-
-
-@pytest.mark.parametrize(("value", "expected"), [(-0.2, 0.2), (-math.inf, None)])
-def test_an_inter_event_time_is_reported_with_its_own_sign(value: float, expected: float | None) -> None:
-    assert reported_value(value, Objective.INTER_EVENT) == expected
-    assert reported_value(value, Objective.STATE) == value
-
-
 @pytest.mark.parametrize("floor", [0.0, 0.01])
 def test_the_certified_cost_is_the_integral_of_the_squared_bound(floor: float) -> None:
     scenario, horizon_s = resolved("double_integrator", f"trigger.floor={floor}"), 30.0
@@ -67,40 +50,3 @@ def test_the_certified_cost_is_the_integral_of_the_squared_bound(floor: float) -
         lambda t: certificate.state(np.array([t]))[0] ** 2, 0, horizon_s, points=kink_s, limit=200
     )
     assert certified == pytest.approx(expected, abs=10 * error)
-
-
-@pytest.mark.parametrize(
-    ("settings", "found", "expected"),
-    [
-        ((), {}, "state: worst at 1.000000 s; all patterns searched (2 runs"),
-        ((), {"value": math.inf, "at_s": 0.0}, "state: the loop diverges\n"),
-        (("network.enforce_mansd=false",), {}, "Nothing enforces this limit of the losses"),
-        (
-            ('plant.disturbances=[{kind="uniform", at="state", bound=[0.1, 0.1]}]',),
-            {},
-            "are drawn from the seeds\nThe worst error and state are for the worst signs of bounded ones",
-        ),
-        (
-            ("plant.measurement.noise_std=[0.1, 0.1]",),
-            {},
-            "Disturbances and noise are drawn from the seeds\n",
-        ),
-        (
-            ('network.impairments=[{kind="delay", delay_s=0.02, jitter_s=0.01}]',),
-            {},
-            "Every delivered update takes the longest delay that is certified, 30 ms",
-        ),
-    ],
-)
-def test_it_is_told_what_was_searched(
-    settings: tuple[str, ...], found: dict[str, float], expected: str
-) -> None:
-    """Of a loop that diverges not all patterns are searched, and no time is the worst."""
-    scenario, output = resolved("double_integrator", *settings), StringIO()
-    certificate = certify(scenario, nominal_conditions(scenario))
-    print_worst(Console(file=output, width=200), [replace(WORST, **found)], scenario, certificate, "sampled")
-    text = output.getvalue()
-    assert expected in text
-    if not settings:
-        assert "seeds" not in text
-        assert "delay" not in text

@@ -11,9 +11,8 @@ import pytest
 
 from cosim.analysis.claims import claim_catalogue
 from cosim.analysis.claims.claim_catalogue import CLAIMS
-from cosim.analysis.claims.claim_evaluation import RunClaims, list_violations
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.claims.setpoint_deviations import start_error
-from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.loops_over_time import loop_over_time
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.align import aligned_parts
@@ -33,7 +32,6 @@ from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import MS, Make, event_s, without
 from tests.cosim.record.changed_records import CONTENT as CHANGING
 from tests.cosim.record.changed_records import changed
-from tests.cosim.simulation.outage import with_outage
 from tests.helpers.shipped import resolved
 from tests.oracles.random_scenarios import POLICIES, random_scenario
 
@@ -78,15 +76,6 @@ def test_certified_claims_hold_in_a_run_that_meets_its_schedule(run: RunRecord) 
         assert 0 <= claim.ratio <= 1
         if claim.certified is not None and claim.what != "minimum inter-event time":
             assert claim.observed == pytest.approx(claim.certified * claim.ratio)
-
-
-def test_a_claim_that_no_sample_was_compared_with_is_not_listed() -> None:
-    """A run with a single event has no inter-event time."""
-    record = simulate(resolved("lane_following", "horizon_s=0.3"))
-    claims = RunClaims(record).evaluate()
-    assert len(record.events()) == 1
-    assert "the state is bounded" in {claim.what for claim in claims}
-    assert "minimum inter-event time" not in {claim.what for claim in claims}
 
 
 def test_the_observed_value_is_the_smallest_bound_that_would_hold(run: RunRecord) -> None:
@@ -162,18 +151,6 @@ def test_claims_about_x_are_compared_at_every_step_of_the_plant(claim: str) -> N
     steps["x"][63] *= 1000.0
     wrong = certified(changed(record, {PLANT_STEP: steps}))[claim]
     assert (wrong.verdict, wrong.since_s) == (VIOLATED, pytest.approx(1.26))
-
-
-def test_the_observed_maximum_of_x_is_that_of_the_steps_of_the_plant() -> None:
-    content = BETWEEN | {"plant": BETWEEN["plant"] | {"initial_state": [0.1, 3.0]}, "horizon_s": 2.31}
-    record = simulate(resolve(validate(content, "between")))
-    steps, state = record[PLANT_STEP], certified(record)["the state is bounded"]
-    assert state.certified is not None
-    (certificate,) = RunClaims(record).certified_evidence.certificates
-    t_s = steps["t_ns"] * 1e-9
-    shares = np.linalg.norm(steps["x"], axis=1) / certificate.state(t_s)
-    assert state.ratio == pytest.approx(shares.max())
-    assert int(shares.argmax()) % 50
 
 
 def test_a_loop_over_time_has_the_state_between_measurements() -> None:
@@ -408,25 +385,6 @@ def test_certificates_speak_of_the_run_until_the_first_change_and_the_identity_o
             assert claim.certified == shorter[key].certified
 
 
-def test_a_change_at_the_start_leaves_nothing_certified() -> None:
-    claims = RunClaims(run_with((0.0, {"trigger.beta": 0.04}))).evaluate()
-    assert {claim.verdict for claim in claims if claim.source == "(I1)"} == {HELD}
-    certified = [claim for claim in claims if claim.is_certified]
-    assert {(claim.verdict, claim.since_s) for claim in certified} == {(VOID, 0.0)}
-    assert {claim.why for claim in certified} == {"settings changed at 0.000 s, before it could be checked"}
-
-
-def test_a_wrong_model_state_after_a_change_violates_the_identity() -> None:
-    record = run_with((2.005, {"controller.setpoint": [3.0, 0.0], "trigger.beta": 0.04}))
-    steps = record[CONTROLLER_STEP].copy()
-    late = int(np.flatnonzero(steps["t_ns"] > 3_000 * MS)[0])
-    steps["x_c"][late] += 1e-3
-    claims = RunClaims(changed(record, {CONTROLLER_STEP: steps})).evaluate()
-    (violated,) = [claim for claim in claims if claim.verdict is VIOLATED]
-    assert violated.what == "x_c − x_s is the sum of the missed jumps"
-    assert violated.since_s == pytest.approx(steps["t_ns"][late] * 1e-9, abs=0.011)
-
-
 def test_a_violated_assumption_of_a_certificate_counts_until_the_change() -> None:
     """The plant applies an old input from 3 s, or from 1 s, to 0.3 s later."""
     record = run_with((2.005, {"trigger.beta": 0.04}))
@@ -493,26 +451,6 @@ def test_the_start_error_is_bounded_between_two_steps() -> None:
     assert start_error(changed(record, {PLANT_STEP: steps}), dt_s) >= largest
 
 
-@pytest.mark.parametrize(("name", "norms"), [("lane_weighted", {"W"}), ("double_integrator", {""})])
-def test_formulas_have_the_weight_of_the_triggers_norm(name: str, norms: set[str]) -> None:
-    claims = RunClaims(simulate(resolved(name, "horizon_s=2"))).evaluate()
-    bounded = [re.match(r"‖(W?) ?e_[cs]‖ ≤", claim.bound) for claim in claims]
-    bounded_norms = [match[1] for match in bounded if match]
-    assert len(bounded_norms) > 5
-    assert set(bounded_norms) == norms
-
-
-def test_the_summary_lists_every_violated_assumption() -> None:
-    """The controller stands still from 0.5 s to 0.7 s."""
-    outage = with_outage(resolved("lane_following", "horizon_s=1"), 0.5, 0.7)
-    reported = summarise_loop(outage, 0, "horizon").assumption_violations
-    assert reported == []  # no process detects that an input is old
-    (violation,) = list_violations(reported, RunClaims(outage).violations())
-    assert (violation.cause, violation.t_s, violation.process) == ("hold", pytest.approx(0.506), "recorder")
-    assert violation.what == "the applied input was up to 0.203 s old, 0.007 s allowed"
-    assert violation.worst_at_s == pytest.approx(0.7)
-
-
 # --- stopped runs --------------------------------------------------------------------------------
 
 
@@ -542,11 +480,3 @@ def test_processes_that_stop_at_different_times_void_no_claim(run: RunRecord, or
     assert {verdict for _, verdict in verdicts} == {ClaimVerdict.HELD}, verdicts
     assert claims.judged_until_s is not None
     assert 3.0 <= claims.judged_until_s <= STOP_NS * 1e-9
-
-
-def test_a_stopped_run_has_the_certificate_of_its_lateness(make: Make) -> None:
-    late = with_outage(make(), 2.0, 2.05)
-    record = stopped(late, {role: STOP_NS + i * APART_NS for i, role in enumerate(LOOP_ROLES)})
-    claims = RunClaims(record).evaluate()
-    verdicts = {claim.verdict for claim in claims if claim.source == "certificate"}
-    assert verdicts == {ClaimVerdict.HELD}, [claim.why for claim in claims]

@@ -32,14 +32,12 @@ from noack.theory.certificates.conditions import allowed_conditions, nominal_con
 from tests.cosim.analysis.claims.conftest import Make, event_s, network_of, without
 from tests.cosim.record.changed_records import changed
 from tests.cosim.simulation.outage import LosingMachine, simulate_with, with_outage
-from tests.helpers.shipped import resolved
 
 Batches = Iterator[tuple[str, Rows] | None]
 """A table and some of its rows; None where the result so far is queried."""
 IN_WINDOW = {"kind": "at_most", "losses": 2, "window": 6}
 RECOVERY = {"kind": "recovery", "deliveries": 2}
 NO_DELAY = network_of(lambda n: 0)
-SERIES = ("losses", "sampling", "delay", "hold", "watchdog", "safe_input")
 
 
 def reported(record: RunRecord) -> list[AssumptionViolation]:
@@ -167,18 +165,6 @@ def test_claims_are_void_from_the_time_and_for_the_reason_that_the_monitor_repor
     first = min(reported(record))
     assert first.t_s == pytest.approx(when_s)
     assert first.text[:20] == reason[:20]
-
-
-def test_the_largest_delay_counts_that_of_the_first_update() -> None:
-    """Its limit is that of the start, so it violates none of delays."""
-    sets = ("horizon_s=3", "network.mansd=0", 'trigger={policy="periodic", period_s=0.5}')
-    record = simulate(resolved("double_integrator", *sets), network_of(lambda number: 20 if number else 150))
-    conditions = read_conditions(record)
-    assert conditions.summary()["delay_s"] == conditions.start_s
-    assert 0.15 <= conditions.start_s <= 0.17
-    largest_of_others_s = conditions.delay.largest()
-    assert largest_of_others_s is not None
-    assert 0.02 <= largest_of_others_s <= 0.04
 
 
 @pytest.mark.parametrize(

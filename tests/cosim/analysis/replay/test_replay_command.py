@@ -73,11 +73,3 @@ def test_a_difference_is_reported_and_fails(runs: Path) -> None:
     document = json.loads(result.stdout)
     assert (result.exit_code, document["first_difference"]["column"]) == (1, "x_c_3")
     assert len(document["changed_since"]) == 1
-
-
-def test_an_empty_record_fails(runs: Path) -> None:
-    for path in (runs / "latest/record").glob("*.parquet"):
-        rewrite(runs, path.stem, lambda rows: rows.slice(0, 0))
-    result = invoke("replay", "--runs", runs)
-    assert result.exit_code == 1
-    assert "nothing to compare" in result.stdout

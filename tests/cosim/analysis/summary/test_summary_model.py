@@ -146,18 +146,3 @@ def test_the_expected_loss_rate_is_shown_beside_the_measured_one(content: dict[s
     summary = summary_of(simulated(content | {"changes": [change]}))
     assert summary.loops[0].loss_expected is None
     assert not any("expected loss" in quantity for quantity, _ in key_numbers(summary))
-
-
-def test_the_assumptions_that_a_change_affects_are_shown_with_its_time(content: dict[str, Any]) -> None:
-    settings = {"trigger.alpha_per_s": 9.0}, {"network.loss.probability": 0.2}
-    changes = [{"at_s": at_s, "set": change} for at_s, change in zip((0.5, 0.7), settings, strict=True)]
-    *at_start, affected = summary_of(simulated(content | {"changes": changes})).loops[0].assumptions
-    assert at_start == summary_of(simulated(content)).loops[0].assumptions
-    assert affected.what.startswith("from 0.500 s on: 0 < α < ᾱ: ")
-    assert (affected.verdict, affected.why[:10]) == ("violated", "α = 9 /s; ")
-
-
-def test_no_loss_rate_is_expected_where_some_losses_are_not_predicted(content: dict[str, Any]) -> None:
-    """Updates that are delivered out of order are lost, and are not in the predicted rate."""
-    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.1, "jitter_s": 0.09}]
-    assert summary_of(simulated(content)).loops[0].loss_expected is None

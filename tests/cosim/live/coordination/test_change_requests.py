@@ -50,13 +50,6 @@ def test_a_value_that_is_in_force_is_no_change_unless_another_one_is_to_come() -
     assert len(requests.announced) == 3
 
 
-def test_a_change_warns_of_the_assumptions_that_it_violates() -> None:
-    requests = requests_of('{ name = "p" }')
-    (warning,) = requested(requests, {"trigger.alpha_per_s": 5.0})["warnings"]
-    assert warning.startswith("an assumption of Theorem 2 is violated: 0 < α < ᾱ: the threshold decays ")
-    assert not requested(requests, {"network.mansd": 2})["warnings"]
-
-
 def test_the_answer_has_the_threshold_without_and_with_the_change() -> None:
     """β = 0.5 and α = 0.25 /s at first. α changes at 4 s, β at 6 s: the level is βe^(−∫α dt)."""
     settings = 'trigger={policy="decaying", beta=0.5, alpha_per_s=0.25}'

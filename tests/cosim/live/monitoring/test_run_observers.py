@@ -1,17 +1,14 @@
 """Who follows a live run: observers, also of extensions, its log, and progress."""
 
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
-from queue import SimpleQueue
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from cosim.live.monitoring import run_observers
-from cosim.live.monitoring.progress import activity, work_bar
 from cosim.live.monitoring.run_observers import RunObserver, RunObservers
 from noack.runtime.control_messages import RunProgress
 from tests.helpers.command_line import invoke
@@ -73,28 +70,3 @@ def test_a_live_run_logs_its_events(tmp_path: Path) -> None:
     assert events["run"]["directory"] == events["end"]["directory"] == str(run_dir)
     assert (events["end"]["status"], events["end"]["reason"]) == (0, "horizon")
     assert events["progress"]["events"] <= summary["loops"][0]["events"]
-
-
-def test_long_work_prints_its_share_and_the_remaining_time_as_lines_without_a_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    now_s = [100.0]
-    monkeypatch.setattr("cosim.live.monitoring.progress.time.monotonic", lambda: now_s[0])
-    for lines in (True, False):
-        with work_bar("trying gains", lines=lines) as show:
-            for share in (0.1, 0.2, 0.25, 1.0):
-                now_s[0] += 6
-                show(share)
-        text = capsys.readouterr().err
-        assert text == lines * "noack: trying gains: 20 % after 12 s, about 48 s left\n"
-
-
-def test_what_a_command_does_is_printed_as_lines_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines: SimpleQueue[str] = SimpleQueue()
-    monkeypatch.setattr("cosim.live.monitoring.progress._LINE_EVERY_S", 0.001)
-    monkeypatch.setattr("cosim.live.monitoring.progress.print_to_stderr", lines.put)
-    with activity("examining M = 1") as change:
-        assert re.fullmatch(r"noack: examining M = 1, \d+ s", lines.get(timeout=60))
-        change("examining M = 2")
-        while not lines.get(timeout=60).startswith("noack: examining M = 2, "):
-            pass

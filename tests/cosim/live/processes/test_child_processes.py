@@ -23,11 +23,6 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="live runs are f
 _NO_DESCRIPTOR = "not a valid run descriptor"
 
 
-class _NoDescriptor:
-    def model_dump_json(self) -> str:
-        return ""
-
-
 @contextmanager
 def started(folder: Path, *roles: str, fork: bool = False) -> Iterator[ChildProcesses]:
     (folder / "logs").mkdir(exist_ok=True)

@@ -6,21 +6,18 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cosim.output.figures.figure_files import inline
 from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.studies.campaign.campaign_figures import (
-    _left_out,
     draw_distribution,
     draw_heat_maps,
     draw_means,
     draw_pareto,
     undominated,
 )
-from cosim.studies.campaign.campaign_file import CampaignAxis
 from cosim.studies.campaign.campaign_report import metric_text
 from cosim.studies.campaign.metrics import estimate
 from tests.cosim.studies.campaign.conftest import HOSTILE
@@ -76,34 +73,3 @@ def test_figures_and_texts_accept_infinite_single_and_many_values() -> None:
     drawn.append(one(draw_distribution, samples, "cost"))
     for figure in drawn:
         assert inline(figure).startswith("<svg")
-
-
-@pytest.mark.parametrize(
-    ("key", "values", "label", "logarithmic"),
-    [
-        ("network.impairments.0.rate_bps", (10_000, 30_000, 100_000), "rate [bit/s]", True),
-        ("plant.rate_hz", (10, 20, 50, 100, 200, 500, 1000), "rate [Hz]", True),
-        ("trigger.alpha_per_s", (0.1, 0.2, 0.3), "rate [1/s]", False),  # not far apart
-        ("network.mansd", (1, 2, 5, 10, 15, 20), "rate", False),  # evenly
-        ("network.impairments.0.delay_s", (0, 0.01, 1.0), "rate [s]", False),  # with 0
-    ],
-)
-def test_an_axis_has_the_unit_of_its_key_and_is_logarithmic_if_its_values_grow_by_factors(
-    key: str, values: tuple[float, ...], label: str, logarithmic: bool
-) -> None:
-    axis = CampaignAxis(name="rate", key=key, values=values)
-    series = {"a": [estimate(np.ones(3)) for _ in values]}
-    drawn = one(draw_means, np.array(values, np.float64), axis.labels, series, axis.heading, "cost")
-    (axes,) = drawn.draw().axes
-    assert (axes.get_xlabel(), axes.get_xscale() == "log") == (label, logarithmic)
-
-
-def test_a_caption_says_what_the_means_leave_out() -> None:
-    whole, half, none = (estimate(np.array(values)) for values in ([1.0, 2.0], [1.0, np.inf], [np.inf] * 2))
-    assert _left_out([whole]) == ""
-    assert _left_out([whole, half]).endswith("left out, at one point 50 % of them")
-    assert _left_out([whole, none]).endswith("left out; where none is left, the point is missing")
-    figure = one(draw_means, np.array([1.0, 2.0]), ["1", "2"], {"a": [whole, half]}, "x", "cost")
-    (axes,) = figure.draw().axes
-    (band,) = axes.collections
-    assert band.get_paths()[0].get_extents().x1 == 1.0  # a single run has no interval

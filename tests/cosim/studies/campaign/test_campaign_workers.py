@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,7 @@ import pytest
 
 from cosim.studies.campaign import campaign_workers
 from cosim.studies.campaign.arithmetic import arithmetic
-from cosim.studies.campaign.campaign_workers import (
-    Chunk,
-    FinishedChunk,
-    LostWorkersError,
-    Work,
-    cluster_runner,
-    run_in_process,
-)
+from cosim.studies.campaign.campaign_workers import LostWorkersError, cluster_runner, run_in_process
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from noack.core.errors import CallerError, PeerError
 from tests.cosim.studies.campaign.conftest import Command, Write, few_of
@@ -143,25 +136,6 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
     assert files(folder).items() >= before.items()
 
 
-@pytest.mark.usefixtures("usual_signals")
-def test_a_signal_ends_a_campaign_with_one_line(
-    many: Path, tmp_path: Path, run_command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def signalled(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[FinishedChunk]:
-        for i, finished in enumerate(run_in_process(works, chunks)):
-            if i == 5:
-                signal.raise_signal(signal.SIGTERM)
-            yield finished
-
-    monkeypatch.setattr(campaign_workers, "run_in_process", signalled)
-    result = run_command(many)
-    assert result.exit_code == 143
-    assert result.stderr.splitlines()[-1] == (
-        f"noack: stopped on request (SIGTERM); 5 of {RUNS} runs are in {tmp_path / 'out'}; "
-        "the same command continues the campaign"
-    )
-
-
 START = "from distributed.cli.dask_{0} import main; main()"
 
 
@@ -277,14 +251,3 @@ def test_an_unreachable_or_invalid_scheduler_address_gives_one_line(
     for address in ("nonsense://x:1", "foo", "", "tcp://x", "tcp://x:abc", "tcp://x:99999"):
         with pytest.raises(CallerError, match="write it as tcp://HOST:PORT"), cluster_runner(address):
             pass
-
-
-def test_only_a_campaign_with_a_scheduler_imports_dask(
-    write: Write, plan: dict[str, Any], run_command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for module in ("distributed", "dask"):
-        monkeypatch.setitem(sys.modules, module, None)
-    result = run_command(write(plan, draws=1, figures=[]))
-    assert result.exit_code == 0, result.output
-    with pytest.raises(CallerError, match=r"pip install 'noack\[cluster\]'"), cluster_runner("x:1"):
-        pass

@@ -16,16 +16,8 @@ from click.testing import Result
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.design_search import (
-    DesignLimits,
-    DesignResult,
-    TriggerSearch,
-    design,
-    measure,
-    require_draws,
-)
+from cosim.studies.design.design_search import DesignLimits, DesignResult, design, measure
 from cosim.studies.design.design_space import families_of, lqr_gain
-from noack.core.errors import CallerError
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.conditions import ideal_conditions
@@ -152,14 +144,6 @@ def test_limits_that_cannot_be_met_give_a_page_and_one_line(
     assert "with the trigger that comes closest to this: 50 % of draws settle within" in html
 
 
-@pytest.mark.usefixtures("no_drawing")
-def test_a_delay_that_the_draws_leave_out_is_named(scalar_file: Path, run_design: Design) -> None:
-    """With 0.8 s the loop that was designed diverges; its delay was left out without a word."""
-    result = run_design(scalar_file, "--set", 'network.impairments=[{kind="delay", delay_s=0.8}]')
-    assert result.exit_code == 0
-    assert "noack: warning: network.impairments: delay: left out, in continuous time" in result.stderr
-
-
 def test_the_lines_about_mistakes_are_those_that_were_approved(
     mass: Path, scalar_file: Path, run_design: Design
 ) -> None:
@@ -172,16 +156,6 @@ def test_the_lines_about_mistakes_are_those_that_were_approved(
         return [result.stderr.strip().replace(str(path), "FILE")]
 
     compare_lines(Path(__file__).with_name("mistakes.txt"), mistake)
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_a_loop_without_a_certificate_is_reported(scalar_file: Path, run_design: Design) -> None:
-    result = run_design(
-        scalar_file, "--settling", "4", "--bound", "error=1", "--under", "schedule",
-        "--set", "plant.rate_hz=2", "--set", "controller.rate_hz=2",
-    )  # fmt: skip
-    assert result.exit_code == 1
-    assert "no certified bound of sup‖e_c‖ (1 allowed)" in result.stderr
 
 
 def test_the_chosen_design_settles_in_time_on_draws_of_another_seed(result: DesignResult) -> None:
@@ -251,25 +225,6 @@ def test_the_trade_off_curve_contains_the_nondominated_candidates(result: Design
             assert not any(sent < a and settling_s < b for a, b in points)
             better = any(a <= sent and b <= settling_s for a, b in points)
             assert better or trial in result.front or settling_s == math.inf
-
-
-def test_of_equal_transmissions_the_earlier_settling_is_chosen(result: DesignResult) -> None:
-    best = result.best
-    later = replace(
-        best,
-        candidate=best.candidate._replace(alpha_per_s=best.candidate.alpha_per_s / 2),
-        measured=best.measured._replace(settling_s=best.measured.settling_s + 0.001),
-    )
-    search = TriggerSearch(result.space, result.limits, box_of(result.scenario), result.seed, 200)
-    assert search._best([later, best]) is best
-
-
-def test_too_few_draws_for_a_quantile_are_refused_with_the_required_number() -> None:
-    with pytest.raises(CallerError, match="--draws: 50 are too few") as error:
-        require_draws(50, 0.95)
-    enough = int(str(error.value).split()[-3])
-    require_draws(enough, 0.95)
-    assert 1 - 0.95**enough >= 0.975  # P(the largest value exceeds the quantile)
 
 
 def test_without_randomness_every_draw_is_the_exact_run(scalar_file: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.design.design_outcome import DesignOutcome, design_for_network, network_outcome
+from cosim.studies.design.design_outcome import DesignOutcome, network_outcome
 from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -110,27 +110,6 @@ def test_the_written_scenario_is_checked_and_decided_as_claimed(tmp_path: Path, 
     pasted = tmp_path / "pasted.toml"
     pasted.write_text(outcome["lines"])
     assert f"gain = [\n  {list(outcome['best']['K'][0])},\n]".replace("[[", "[") in outcome["lines"]
-
-
-def test_a_period_between_two_measurements_is_said_to_be_longer() -> None:
-    outcome = searched(shipped("unstable_pendulum"), DesignRequest(period_s=0.2503, effort=0, most=1))
-    assert "--period 0.2503: updates are sent at measurements, every 0.252 s" in outcome.shown.notes
-
-
-def test_a_file_that_is_no_scenario_is_kept(tmp_path: Path) -> None:
-    path = tmp_path / "notes.toml"
-    path.write_text("mine = 1")
-    result = invoke("design", "lane_periodic", "--for", "network", "--out", path)
-    assert result.stderr == f"noack: --out {path}: exists, and is no scenario; give another name\n"
-    assert path.read_text() == "mine = 1"
-
-
-@pytest.mark.parametrize("losses", [0, 2])
-def test_no_m_is_examined_beyond_what_a_constraint_allows(losses: int) -> None:
-    constraint = f'network.constraints=[{{kind="at_most", losses={losses}, window=10}}]'
-    scenario = shipped("double_integrator", constraint)
-    shown = design_for_network(scenario, DesignRequest(period_s=2.0, effort=0, most=4))
-    assert shown.given.document["certified"] == shown.best.document["certified"] == losses + 1
 
 
 def test_the_lines_about_mistakes_are_those_that_were_approved(tmp_path: Path) -> None:
