@@ -15,7 +15,7 @@ from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.templates import Templates
 from noack_check.balls import matrix, number
 from noack_check.model import Model
-from tests.checker.test_witnesses import IDEAL, bounds_of, double_integrator, relative
+from tests.checker.test_witnesses import IDEAL, bounds_of, double_integrator
 
 
 @pytest.mark.parametrize("lowest", [0.15, 0.42, 0.6, 0.85])
@@ -114,12 +114,6 @@ def test_a_search_ends_at_its_limit_of_work() -> None:
         effort.add("x", 1.0)
 
 
-def test_what_fails_is_named() -> None:
-    loop = double_integrator()
-    with pytest.raises(NoWitnessError, match=r"^drift: the solver finds no quadratic forms"):
-        find_witness(loop._replace(half_B=matrix([[0.0], [0.9]])))
-
-
 def test_a_disturbance_shortens_the_time_between_events_as_little_as_possible() -> None:
     """Both parts of the drift's bound count in units of their thresholds, 0.05 and 0.0005."""
     loop = double_integrator(floor=0.0005)._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(0.0005),))
@@ -155,17 +149,3 @@ def test_with_many_events_while_an_update_is_on_its_way_there_is_no_witness() ->
     slow = loop._replace(times=loop.times._replace(delay=fmpq(1)), half_B=matrix([[0.0], [0.9]]))
     with pytest.raises(NoWitnessError):
         find_witness(slow)
-
-
-def test_the_reason_is_the_number_of_events_if_it_is_too_large() -> None:
-    """Of a relative rule each test may be an event: 9 within 0.1 s after one."""
-    times = IDEAL._replace(sampling=fmpq(1, 100), least_sampling=fmpq(1, 100), delay=fmpq(1, 10))
-    with pytest.raises(NoWitnessError, match=r"^9 events may happen while an update is on its way: at most"):
-        find_witness(relative(0.1)._replace(times=times))
-
-
-def test_a_problem_that_would_take_minutes_is_not_begun() -> None:
-    effort = Effort(lambda share: None)
-    effort.add("x", 1.0)
-    with pytest.raises(WorkLimitError, match="drift: its inequalities are too large for the search"):
-        effort.add("drift", 9.0)

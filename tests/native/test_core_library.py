@@ -4,13 +4,12 @@ import os
 import shutil
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from native.build import HEADER, NO_COMPILER, is_current
+from native.build import HEADER, is_current
 from noack.core.core_library import LIBRARY, address_of, core, dtype_of, ffi, load_core, pointer_to
 from noack.core.errors import CallerError
 from noack.impairments.feature import StageTables
@@ -137,45 +136,6 @@ def test_a_build_compiles_only_what_has_changed_and_says_so_in_one_line(copy: Pa
         file.write("/* changed */\n")
     assert build(copy).stdout == first.stdout
     assert files(copy)[HEADER] != made[HEADER]
-
-
-@needs_compiler
-def test_a_mistake_leaves_the_earlier_core_as_it_was(copy: Path) -> None:
-    build(copy)
-    made = files(copy)
-    with (copy / "network" / "link.c").open("a") as file:
-        file.write("int mistake(\n")
-    done = build(copy)
-    assert done.returncode == 1
-    assert "link.c" in done.stderr
-    assert done.stderr.splitlines()[-1].startswith("the core cannot be built")
-    assert files(copy) == made
-
-
-@needs_compiler
-def test_the_second_of_two_builds_at_a_time_compiles_nothing(copy: Path) -> None:
-    """What a killed build has left is removed."""
-    left = copy.parent / "core" / ".building-x"
-    left.mkdir(parents=True)
-    (left / LIBRARY.name).write_bytes(b"half of")
-    with ThreadPoolExecutor() as pool:
-        done = list(pool.map(build, [copy, copy]))
-    assert [process.returncode for process in done] == [0, 0]
-    assert sorted(len(process.stdout.splitlines()) for process in done) == [0, 1]
-    assert files(copy).keys() == {LIBRARY.name, HEADER}
-
-
-def test_a_build_without_a_compiler_says_what_to_install(copy: Path, tmp_path: Path) -> None:
-    """Without the installed packages (-S), among them ziglang; test_same_bits.py builds with it."""
-    command = [sys.executable, "-S", copy / "build.py", "--into", copy.parent / "core"]
-    done = subprocess.run(
-        command, env={"PATH": str(tmp_path)}, capture_output=True, text=True, check=False,
-        timeout=100,
-    )  # fmt: skip
-    assert done.returncode == NO_COMPILER
-    (line,) = done.stderr.splitlines()
-    assert "gcc" in line
-    assert "ziglang" in line
 
 
 def test_noacks_own_core_is_never_a_sanitized_one() -> None:

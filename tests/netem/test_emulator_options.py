@@ -1,25 +1,18 @@
 """A command line gives links; mistakes give error messages."""
 
-import errno
 import json
-import os
 import re
 import shlex
-import socket
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from netem import stand_alone
 from netem.__main__ import main
 from netem.emulator_options import command_line_parser as parser
 from netem.emulator_options import parse_options, specs_of
-from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import EXAMPLES, KEYWORDS, parse, settings_of
-from noack.core.errors import MachineError
 from noack.impairments.kinds.loss import LOSS_WORDS
 from tests.helpers.approved import compare_lines
 
@@ -50,17 +43,6 @@ def test_a_command_line_describes_a_link(
     assert specs(f"{ADDRESSES} {arguments}") == (link,)
 
 
-def test_statistics_do_not_replace_the_file_of_links(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    links = tmp_path / "links.toml"
-    links.write_text('link = [{name = "a", listen = ":0", to = ":9001"}]\n')
-    before = links.read_bytes()
-    assert main(["--links", str(links), "--stats-file", str(links)]) == 2
-    assert capsys.readouterr().err.endswith("--links has the same file; choose another\n")
-    assert links.read_bytes() == before
-
-
 _OF_THE_SYSTEM = re.compile(r"\((\[Errno|Name or service).*\)$")
 """Texts that depend on the system, or on a library."""
 
@@ -78,19 +60,6 @@ def test_a_mistake_ends_the_program_with_the_approved_line(
         return [_OF_THE_SYSTEM.sub("(…)", err.strip()).replace(str(Path.cwd()), "FOLDER")]
 
     compare_lines(Path(__file__).with_name("option_mistakes.txt"), mistake)
-
-
-def test_a_socket_that_cannot_be_made_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def without_ipv6(family: int = socket.AF_INET, *arguments: Any, **options: Any) -> socket.socket:
-        raise OSError(errno.EAFNOSUPPORT, "as the operating system says it")
-
-    monkeypatch.setattr("socket.socket", without_ipv6)
-    assert main(["--listen", "[::1]:0", "--to", "[::1]:9"]) == MachineError("").exit_status
-    reason = os.strerror(errno.EAFNOSUPPORT)
-    line = f"noack netem: the sockets of the links cannot be opened: {reason}\n"
-    assert capsys.readouterr().err == line
 
 
 @pytest.mark.parametrize("columns", ["120", "60"])
@@ -118,15 +87,3 @@ def test_every_word_is_in_the_help_and_has_an_example() -> None:
         assert parse(example)
         assert synonyms.get(word, word) in example.split()
     assert set(KEYWORDS) - EXAMPLES.keys() == {"seed"}
-
-
-def test_settings_that_are_not_permitted_are_reported(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    answers = {"sched_fifo": "not permitted: why", "memory_lock": "applied"}
-    monkeypatch.setattr(stand_alone, "realtime", lambda *_: nullcontext(answers))
-    monkeypatch.setattr(Relay, "run", lambda *_: None)
-    assert main(["--listen", ":0", "--to", ":9001", "--realtime", "--json"]) == 0
-    reported = capsys.readouterr().err
-    assert "noack netem: sched_fifo not permitted: why\n" in reported
-    assert "memory_lock" not in reported

@@ -72,15 +72,3 @@ def test_links_are_explained_by_the_approved_text(
         return [line.rstrip() for line in text.splitlines() if line.strip()]
 
     compare_lines(Path(__file__).with_name("explained.txt"), explained)
-
-
-def test_a_command_of_tc_is_complete_in_a_terminal_of_any_width(explain: Explain) -> None:
-    commands = set()
-    for columns in (200, 60, 30):
-        out = explain("delay 10ms 2ms distribution normal loss gemodel 1%", columns=columns)
-        command = out[out.index("tc qdisc") :].partition("\ndifference")[0]
-        commands.add(" ".join(command.replace("\\\n", "").split()))
-    assert commands == {
-        "tc qdisc add dev DEVICE root netem limit 16384 delay 10ms 2ms distribution normal "
-        "loss gemodel 1% 99% 100% 0%"
-    }

@@ -101,29 +101,6 @@ def test_a_mistake_is_one_line(arguments: tuple[str, ...], message: str) -> None
     assert "\n" not in str(error.value)
 
 
-def test_an_address_in_use_is_told_on_entering(ends: Ends) -> None:
-    used = ends.server.getsockname()
-    with (
-        pytest.raises(NoackError, match="already taken"),
-        noack.LossyUdp("127.0.0.1:9", listen=used),
-    ):
-        pass
-    with noack.LossyUdp("127.0.0.1:9") as link, pytest.raises(NoackError, match="to and fro"):
-        link.change("loss 1%", directions=["to and fro"])  # type: ignore[list-item]
-    with pytest.raises(NoackError, match="has ended"):
-        link.change("loss 1%")
-    with pytest.raises(NoackError, match="has ended"), link:
-        pass
-    with pytest.raises(NoackError, match="not entered"):
-        _ = noack.LossyUdp("127.0.0.1:9").address
-
-
-def test_words_may_name_files(ends: Ends, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "trace.txt").write_text("0 1 1\n")
-    monkeypatch.chdir(tmp_path)
-    assert arrived(ends, "loss trace trace.txt", 0, 6) == [True, False, False] * 2
-
-
 def run_pytest(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     plugin = ["-p", "no:noack", "-p", "netem.pytest_plugin"]  # if it is not installed here, too
     return subprocess.run(
@@ -184,9 +161,3 @@ def test_the_test_of_the_documentation_passes(tmp_path: Path) -> None:
     (tmp_path / "test_repeating_client.py").write_text(program)
     done = run_pytest(tmp_path, "-q")
     assert done.returncode == 0, done.stdout
-
-
-def test_the_plugin_loads_nothing_for_tests_without_it() -> None:
-    code = "import sys, netem.pytest_plugin; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"numpy", "noack.core.core_library", "netem.relay.relay"} & set(done.stdout.split())

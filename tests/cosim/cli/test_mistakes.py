@@ -70,12 +70,6 @@ def test_with_json_a_mistake_is_a_document_too(line: str) -> None:
     assert json.loads(result.stdout) == {"error": message, "exit": {"status": 2, "reason": message}}
 
 
-def test_every_command_names_what_it_does_not_find() -> None:
-    for command in ("run", "doctor", "simulate"):
-        assert noack(f"{command} nothing").stderr == noack("check nothing").stderr
-    assert f"noack: {'q' * 77}...: no such file" in noack(f"check {'q' * 3000}").stderr
-
-
 def test_a_process_that_fails_is_named_once(tmp_path: Path) -> None:
     """Both the process's log and the launcher name the process; the message contains it once."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
@@ -97,11 +91,3 @@ def test_a_process_that_fails_is_named_once(tmp_path: Path) -> None:
     assert process.returncode == 2
     assert process.stderr == f"noack: {expected} (logs in {run_dir / 'logs'})\n"
     assert (run_dir / "logs/sensor.log").read_text() == f"noack {expected}\n"
-
-
-def test_a_deleted_current_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (folder := tmp_path / "folder").mkdir()
-    monkeypatch.chdir(folder)
-    folder.rmdir()
-    result = noack("simulate lane_following")
-    assert (result.exit_code, result.stderr) == (1, "noack: the current folder was deleted\n")

@@ -28,7 +28,6 @@ UNENFORCED = ("--set", "network.enforce_mansd=false")
         # The model has a certificate, and the plant has none.
         (("cart_pole", *ALL), [f"{word}: no certificate for the plant, which is not linear"
                                for word in Requirement]),
-        (("sine_pendulum", "--require", "certificate"), []),
         (("model_predictive", *ALL), [f'{word}: controller.kind = "python": u is not K x_c'
                                       for word in Requirement]),
         (("lane_acknowledged", *ALL), [f'{word}: network.protocol = "ack"' for word in Requirement]),

@@ -11,7 +11,7 @@ import noack
 from cosim.measurement.certificate_time import DELAY, certificate_time
 from noack.core.errors import CallerError
 from noack.scenario.scenario import Scenario
-from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace, read_trace
+from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 
 MS = 1_000_000
 TRACES = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
@@ -86,21 +86,6 @@ def test_the_first_update_must_be_received_unless_the_state_is_known() -> None:
     assert certificate_time(trace, lane(mansd=2, initial_sync="known_state")).first_s is None
 
 
-def test_the_certificates_of_the_scenario_are_named() -> None:
-    trace = read_trace(TRACES / "rural_n8_10kmh.csv")
-    void = certificate_time(trace, lane())
-    assert None in void.certificates.values()
-    assert [cause.cause for cause in void.causes] == [DELAY]
-    assert void.causes[0].worst == pytest.approx(9.744)
-    slow = lane(impairments=[{"kind": "delay", "delay_s": 9.8}])
-    slow_void = certificate_time(trace, slow)
-    assert slow_void.share == 0.0
-    assert slow_void.kept["dropouts"] == "kept"  # nothing was lost
-    assert slow_void.kept[DELAY].startswith("kept: an update was in the network for 9.744 s, 9.8")
-    acknowledged = certificate_time(trace, noack.load("lane_acknowledged"))
-    assert all(reason is not None for reason in acknowledged.certificates.values())
-
-
 def test_conditions_that_change_during_the_run_are_not_compared_with_a_trace() -> None:
     """With M − 1 = 8 at the start and 2 from 1 s on, 4 losses at 3 s were 'kept: 8 allowed'."""
     sent_ns = np.arange(100) * 100_000_000
@@ -111,16 +96,3 @@ def test_conditions_that_change_during_the_run_are_not_compared_with_a_trace() -
     scenario = noack.load("lane_following", {"network.mansd": 8, "changes": changes})
     with pytest.raises(CallerError, match="changes: needs settings that stay the same"):
         certificate_time(trace, scenario)
-
-
-def test_the_answer_is_yes_or_the_first_reason_against_it() -> None:
-    trace = read_trace(TRACES / "rural_n8_10kmh.csv")
-    assert certificate_time(trace, lane()).answer == (
-        "lane_following: certified on this network: no, because an update was in the network for 9.744 s, "
-        "0.004 s allowed at worst; first violated at 0.004 s"
-    )
-    slow = certificate_time(trace, lane(impairments=[{"kind": "delay", "delay_s": 9.8}])).answer
-    assert slow.startswith("lane_following: certified on this network: no, because there is no certificate: ")
-    sent_ns = 100 * MS * np.arange(15)
-    kept = packet_trace(sent_ns, sent_ns + 1 * MS, np.zeros(15, bool))
-    assert certificate_time(kept, lane()).answer == "lane_following: certified on this network: yes"

@@ -32,7 +32,6 @@ from cosim.record.run_directory import (
     new_run_dir,
     point_to_latest,
     require_output,
-    require_run_directory,
     write_output,
 )
 from cosim.record.run_record import load_record
@@ -240,12 +239,6 @@ def test_no_output_is_written_among_the_results(held: tuple[Path, str], name: st
             require_output(path)
 
 
-def test_no_output_replaces_the_folder_of_results(held: tuple[Path, str]) -> None:
-    folder, holder = held
-    with pytest.raises(CallerError, match=f"held: {holder}; give another name"):
-        require_output(folder)
-
-
 def test_tables_figures_and_exports_replace_no_results(
     held: tuple[Path, str],
 ) -> None:
@@ -259,9 +252,3 @@ def test_tables_figures_and_exports_replace_no_results(
     with pytest.raises(CallerError, match="give another name"):
         export_run(folder, folder, "csv")
     assert not tables.exists()
-
-
-def test_a_campaigns_folder_is_no_run_directory(tmp_path: Path) -> None:
-    (tmp_path / CAMPAIGN_FILE).write_text("{}")
-    with pytest.raises(CallerError, match=r"not a run directory \(the folder of a campaign\)"):
-        require_run_directory(tmp_path)

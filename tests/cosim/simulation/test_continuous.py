@@ -1,7 +1,6 @@
 """Exact event times against closed forms, and the output of `noack simulate --trigger continuous`."""
 
 import itertools
-import json
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -13,13 +12,10 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from cosim.simulation.continuous import (
-    POINTS,
     ContinuousLoop,
     ContinuousRun,
     TooManyEventsError,
-    document,
     network_fates,
-    run_continuous,
     simulate_continuous,
 )
 from cosim.simulation.virtual_time import simulate
@@ -30,7 +26,6 @@ from noack.scenario.resolution import LoopMatrices, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.trigger_policies.trigger_rule import TriggerRule
-from tests.helpers.command_line import invoke
 from tests.helpers.example_rules import decaying_rule
 
 
@@ -225,33 +220,3 @@ def test_the_fates_are_those_of_the_simulated_network(resolved: Scenario) -> Non
     later_first = [fates(i) for i in reversed(range(len(packets)))][::-1]
     assert later_first == (packets["fate"] != Fate.DROPPED).tolist()
     assert fates(0)
-
-
-def test_the_json_document_agrees_with_the_run(resolved: Scenario) -> None:
-    run = run_continuous(resolved)
-    content = json.loads(json.dumps(document(run, resolved), allow_nan=False))
-    summary, events, samples = content["summary"], content["events"], content["samples"]
-    assert summary["events"] == len(events) == len(run.before) > 5
-    assert summary["deliveries"] == sum(event["delivered"] for event in events)
-    assert summary["drops"] == summary["events"] - summary["deliveries"]
-    assert summary["longest_loss_burst"] <= resolved.network.mansd
-    lost = "".join("." if event["delivered"] else "x" for event in events)
-    assert summary["longest_loss_burst"] == max(map(len, lost.split(".")))
-    times = [event["t_s"] for event in events]
-    assert summary["inter_event_min_s"] == pytest.approx(np.diff(times).min())
-    assert len(samples["t_s"]) == len(samples["x"]) == len(samples["x_c"]) == POINTS
-    assert np.max(np.array(samples["e_s_norm"]) / samples["threshold"]) <= 1 + 1e-12
-    errors = np.array(samples["x_c"]) - np.array(samples["x"])
-    np.testing.assert_allclose(np.linalg.norm(errors, axis=1), samples["e_c_norm"], atol=1e-12)
-
-
-def test_the_command_names_all_that_limits_losses_and_refuses_a_delay() -> None:
-    """It printed the cap M − 1 = 4 where at most 3 may be lost, and dropped a delay without a word."""
-    words = ("simulate", "lane_constrained", "--trigger", "continuous")
-    assert "longest loss burst (at most 3 allowed)" in invoke(*words).stdout
-    result = invoke(*words, "--set", 'network.impairments=[{kind="delay", delay_s=0.5}]')
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr == (
-        "noack: in continuous time: network.impairments: delay: the network has no delay there; "
-        "leave it out: network.impairments=[]\n"
-    )

@@ -16,7 +16,6 @@ from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario_file import validate
 from noack.trigger_policies.quadratic import QuadraticSettings
 from plant_server.plant import plants_of
-from tests.helpers.command_line import invoke
 from tests.oracles.comparison import Comparison
 from tests.oracles.random_scenarios import random_scenario
 
@@ -73,7 +72,7 @@ def test_a_whole_period_stays_whole() -> None:
     "name", ["lane_following", "lane_actuation_loss", "pendulum_observed", "lane_crosswind"]
 )
 @pytest.mark.parametrize(("plant_hz", "controller_hz"), [
-    (30.0, 30.0), (60.0, 30.0), (144.0, 48.0), (90.0, 120.0), (30_000 / 1001, 500.0),
+    (60.0, 30.0), (90.0, 120.0), (30_000 / 1001, 500.0),
 ])  # fmt: skip
 def test_a_run_is_that_of_the_reference_loop(name: str, plant_hz: float, controller_hz: float) -> None:
     scenario = resolve(at_rate(name, plant_hz, controller_hz))
@@ -85,7 +84,7 @@ def test_a_run_is_that_of_the_reference_loop(name: str, plant_hz: float, control
     assert replay(record).bit_exact
 
 
-@pytest.mark.parametrize("number", range(24))
+@pytest.mark.parametrize("number", range(12))
 def test_random_scenarios_run_as_the_reference_loop(number: int) -> None:
     content = random_scenario(number)
     rng = np.random.default_rng(number)
@@ -124,28 +123,6 @@ def test_claims_and_identity_hold(rate_hz: float) -> None:
     if rate_hz > 100:
         assert loop.certified_for is None
         assert sum(claim.is_certified and claim.verdict == "held" for claim in loop.claims) > 4
-
-
-def test_usual_rates_need_no_warning() -> None:
-    rates = ("--set", "plant.rate_hz=30", "--set", "controller.rate_hz=30")
-    checked = invoke("check", "lane_following", *rates)
-    assert (checked.exit_code, checked.stderr) == (0, "")
-    assert "rate_hz = 30" in checked.stdout
-    assert "no certificate" not in checked.stdout
-
-
-@pytest.mark.parametrize("settings", [
-    ("pendulum_observed",),
-    ("lane_crosswind", "--set", 'plant.disturbances=[{kind="gaussian",std=[0.1,0.1]}]'),
-    ("pendulum_observed", "--set", 'loops=[{name="one"},{name="two"}]'),
-])  # fmt: skip
-def test_check_says_which_periods_allow_no_certificate(settings: tuple[str, ...]) -> None:
-    def lines(rate_hz: float) -> str:
-        rates = ("--set", f"plant.rate_hz={rate_hz}", "--set", f"controller.rate_hz={rate_hz}")
-        return " ".join(invoke("check", *settings, *rates).stdout.replace("#", "").split())
-
-    assert "no certificate: plant.rate_hz = 90: bounds with" in lines(90.0)
-    assert "no certificate" not in lines(100.0)
 
 
 @pytest.mark.parametrize("rate_hz", RATES)
@@ -198,57 +175,3 @@ def test_an_acknowledgement_is_waited_for_as_many_steps_at_each_rate() -> None:
 
 
 NEARBY = {30.0: 30.000000300000004, 60.0: 59.99999880000002, 90.0: 89.99999991, 144.0: 1e9 / 6_944_444}
-
-
-@pytest.mark.parametrize("rate_hz", NEARBY)
-def test_margin_and_cost_are_nearly_those_of_a_rate_with_whole_nanoseconds(rate_hz: float) -> None:
-    def results(rate_hz: float) -> tuple[Any, Any]:
-        trigger = {"policy": "periodic", "period_s": 6 / rate_hz}
-        noise = {"plant.disturbances": [{"kind": "gaussian", "std": [0.1, 0.1]}]}
-        quiet, noisy = (at_rate("lane_periodic", rate_hz, rate_hz, trigger=trigger, **s) for s in ({}, noise))
-        return noack.margin(quiet, most_m=4), noack.cost(noisy)
-
-    (margin, cost), (near_margin, near_cost) = results(rate_hz), results(NEARBY[rate_hz])
-    assert margin.period_s == cost.period_s == 6 / rate_hz
-    for cap, near_cap in zip(margin.caps, near_margin.caps, strict=True):
-        assert cap.stability.lower == pytest.approx(near_cap.stability.lower, rel=1e-6)
-        assert cap.stability.verdict == near_cap.stability.verdict
-    assert margin.period is not None
-    assert margin.period.stable_s == pytest.approx(near_margin.period.stable_s, rel=1e-7)
-    assert margin.without_guarantee.per_period == pytest.approx(
-        near_margin.without_guarantee.per_period, rel=2e-6
-    )
-    for name in ("horizon_cost", "transient_cost", "growth"):
-        wanted = getattr(near_cost.with_guarantee, name)
-        assert getattr(cost.with_guarantee, name) == pytest.approx(wanted, rel=1e-5), name
-    wanted = near_cost.with_guarantee.stationary.cost_per_s
-    assert cost.with_guarantee.stationary.cost_per_s == pytest.approx(wanted, rel=1e-6)
-
-
-@pytest.mark.parametrize("time", ["continuous", "sampled"])
-def test_a_campaign_has_nearly_the_results_of_a_rate_with_whole_nanoseconds(time: str) -> None:
-    def estimates(rate_hz: float) -> dict[tuple[str, str], float]:
-        rates = {"plant.rate_hz": rate_hz, "controller.rate_hz": rate_hz, "horizon_s": 3.99}
-        variants = {
-            "decaying": {"mode": "model"},
-            "periodic": {"trigger": {"policy": "periodic", "period_s": 3 / rate_hz}},
-        }
-        plan = {
-            "name": "rates", "scenario": "lane_following", "draws": 10, "seed": 3, "time": time,
-            "settings": rates, "axes": [{"name": "policy", "variants": variants}],
-        }  # fmt: skip
-        rows = noack.campaign(plan, workers=1).estimates().to_pylist()
-        return {(row["policy"], row["metric"]): row["mean"] for row in rows}
-
-    exact, near = estimates(90.0), estimates(NEARBY[90.0])
-    assert exact["periodic", "transmissions"] == near["periodic", "transmissions"] == 120
-    for metric in ("transmissions", "cost", "final_norm", "sup_e_c_scaled"):
-        for policy in ("decaying", "periodic"):
-            assert exact[policy, metric] == pytest.approx(near[policy, metric], rel=1e-5)
-
-
-def test_what_needs_equal_steps_says_so() -> None:
-    run = noack.simulate(at_rate("pendulum_observed", 90.0, 90.0))
-    reasons = [claim.why for claim in run.summary.loops[0].claims if claim.is_certified]
-    assert reasons
-    assert all("a period of whole nanoseconds" in why for why in reasons)

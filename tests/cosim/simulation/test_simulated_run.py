@@ -10,14 +10,13 @@ import pytest
 import rerun.chunk
 from typer.testing import Result
 
-from cosim.analysis.summary import loops_over_time
 from cosim.analysis.summary.summary_model import ReplayPart, read_summary
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint
 from cosim.record.run_directory import RunEnding, write_environment
 from cosim.record.run_record import RecordedRun, RunRecord, load_record
 from cosim.simulation.virtual_time import Progress, simulate, simulate_run
-from noack.core.errors import CallerError, ExitStatus, MachineError
+from noack.core.errors import ExitStatus, MachineError
 from noack.core.number_format import number as written
 from noack.protocol.record_tables import tables
 from noack.scenario.resolution import resolve
@@ -135,59 +134,6 @@ def test_commands_refuse_a_damaged_table_in_one_line(run_dir: Path, tmp_path: Pa
     assert invoke("summary", damaged).stderr == f"noack: {damaged}: has no numeric record\n"
 
 
-@pytest.mark.usefixtures("no_drawing")
-def test_the_summary_and_the_page_of_a_run_name_the_pages_of_its_loops(run_dir: Path) -> None:
-    assert invoke("report", run_dir, "--loop", "periodic").exit_code == 0
-    shown = "".join(invoke("summary", run_dir, "--loop", "periodic").stdout.split())
-    assert f"more:{run_dir}/report-periodic.htmland" in shown
-    assert invoke("report", run_dir).exit_code == 0
-    page = (run_dir / "report.html").read_text()
-    assert '<a href="report-periodic.html">periodic</a>' in page
-    assert "report-pendulum-01.html" not in page  # no report of that loop was written
-
-
-def test_a_report_is_refused_if_the_scenario_has_other_loops_than_the_record(run_dir: Path) -> None:
-    scenario = run_dir / "scenario.toml"
-    text = scenario.read_text()
-    scenario.write_text(text.replace("count = 10", "count = 9"))
-    result = invoke("report", run_dir, "--again")
-    scenario.write_text(text)
-    assert (result.exit_code, "has other loops than" in result.stderr) == (2, True)
-
-
-@pytest.mark.usefixtures("no_recording")
-def test_the_verdict_of_all_loops_says_why_claims_are_void(tmp_path: Path) -> None:
-    """The reasons of the loops differ in numbers only; those of the plant and of the box have a line each."""
-    settings = ("horizon_s=1", "certificate.late_periods=20", 'loops=[{ name = "p", count = 3 }]')
-    late = simulated(tmp_path, *settings, options=["--no-report"])
-    claims = [claim for loop in json.loads(late.stdout)["loops"] for claim in loop["claims"]]
-    reasons = {claim["why"] for claim in claims if claim["verdict"] == "void"}
-    output = invoke("summary", tmp_path / "latest").stdout
-    assert any(f"no certificate: {why}" in output for why in reasons)
-    kinds = {re.sub(r"\d+\.?\d*", "#", why) for why in reasons}
-    lines = re.findall(r"^void: .* \(3 loops\)$", output, re.MULTILINE)
-    assert len(lines) == (len(kinds) if len(kinds) > 1 else 0)
-
-
-@pytest.mark.parametrize("loop", [None, "periodic"])
-def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: str | None) -> None:
-    path = run_dir / ("recording.rrd" if loop is None else f"recording-{loop}.rrd")
-    path.unlink(missing_ok=True)
-    result = invoke("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
-    assert json.loads(result.stdout) == {"recording": str(path), "exists": True}
-    assert path.read_bytes().startswith(b"RRF")
-
-
-@pytest.mark.usefixtures("no_recording", "no_drawing")
-def test_the_report_reads_no_loop_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """How each loop went is known at the end of a run; to find it out takes most of the time."""
-    monkeypatch.setattr(loops_over_time, "loop_over_time", None)
-    loops = 'loops=[{ name = "a", count = 6 }]'  # enough for a map that is a bitmap
-    ending = simulate_run(load(PATH, ["horizon_s=0.5", loops]), tmp_path)
-    finalize(ending)
-    assert (ending.run_dir / "report.html").is_file()
-
-
 @pytest.mark.usefixtures("no_report", "no_recording")
 def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     own = "A = [[0.0, 1.0], [50.0, 0.0]], B = [[0.0], [1.0]]"
@@ -277,13 +223,3 @@ def test_an_interrupted_simulation_leaves_no_run_directory(
     with pytest.raises(expected):
         simulate_run(load(ONE_LOOP, SETTINGS), tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_recorded_scenario_may_exceed_the_size_limit_of_scenarios(tmp_path: Path) -> None:
-    (tmp_path / "long.txt").write_text("10" * 150_000)
-    trace = f'network.loss={{model="trace",file="{tmp_path}/long.txt"}}'
-    ending = simulate_run(load(ONE_LOOP, (*SETTINGS, trace)), tmp_path)
-    assert load_record(ending.run_dir).scenario.network.loss.model == "scripted"
-    assert load(ending.run_dir).network.loss.model == "scripted"  # to repeat the run
-    with pytest.raises(CallerError, match=r"scenario.toml: cannot be read: larger than 1 MiB$"):
-        load(ending.run_dir / "scenario.toml")

@@ -28,7 +28,6 @@ from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.connections.zenoh_session import open_session
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.conftest import Emulate
-from tests.netem.control import fake_relay as relays
 from tests.netem.control.fake_relay import FakeRelay
 from tests.netem.relay.relays import endpoints
 
@@ -60,12 +59,6 @@ def test_a_session_is_found_while_it_lasts() -> None:
     with pytest.raises(FileExistsError, match="capture"), registered_emulator("d"):
         raise FileExistsError("capture.pcapng")  # an error of the emulator itself
     assert running_emulators() == []
-
-
-@pytest.mark.parametrize("name", ["", "a/b", "../up", ".hidden", "x" * 65])
-def test_names_that_are_unsafe_as_file_names_are_refused(name: str) -> None:
-    with pytest.raises(CallerError, match="use letters, digits"), registered_emulator(name):
-        pass
 
 
 def test_statistics_are_published(
@@ -100,12 +93,6 @@ def test_a_mistake_gets_the_approved_line_and_changes_nothing(
             (error,) = [reply.err for reply in replies if reply.err is not None]
             assert error.payload.to_string() == "a query is a JSON object"
     assert relay.changes == 0
-
-
-def test_a_second_server_of_the_name_is_refused(server: ControlServer) -> None:
-    with pytest.raises(CallerError, match=r"^--control lab: an emulator of this name runs"):
-        ControlServer("lab", CommandQueue(FakeRelay("up"))).__enter__()
-    assert running_emulators() == ["lab"]
 
 
 def test_a_client_that_blocks_the_server_does_not_block_the_relay(
@@ -165,16 +152,6 @@ def test_a_link_is_set_in_words(
     assert out[2:] == ["down forward: loss 10% delay 10ms mansd 2", "down reverse: no impairment"]
 
 
-@pytest.mark.usefixtures("server")
-def test_of_several_emulators_one_must_be_named(capsys: pytest.CaptureFixture[str]) -> None:
-    other = FakeRelay("x")
-    with relays.running(other) as commands, ControlServer("loss", commands):
-        assert run("show") == ExitStatus.CALLER
-        assert "which emulator? Running: lab, loss" in capsys.readouterr().err
-        assert run("set loss loss 5%") == ExitStatus.OK  # the name is also a netem word
-    assert other.settings["x", "forward"] == settings_of("loss 5%")
-
-
 def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
     relay: FakeRelay, server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -192,20 +169,6 @@ def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
         assert run("watch lab") == ExitStatus.OK
         reading.result()
     assert [line.split("  ")[1] for line in lines] == ["up forward", "down", "up forward", "down"]
-
-
-def test_watch_fails_when_the_emulator_ends(
-    relay: FakeRelay,
-    commands: CommandQueue,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr(emulator_commands, "_SILENCE_S", 0.1)
-    relay.counters["up", "forward"].received = 7
-    emulator = ControlServer("lab", commands).__enter__()
-    monkeypatch.setattr(emulator_commands, "_print_lines", lambda _: emulator.__exit__())
-    assert run("watch lab") == ExitStatus.FAILED
-    assert capsys.readouterr().err == "noack netem watch: emulator 'lab' has ended\n"
 
 
 def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:

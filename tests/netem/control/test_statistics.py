@@ -20,7 +20,6 @@ from netem.control.statistics_text import statistics_lines
 from netem.relay.relay_reports import FlowReport
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
-from tests.helpers.approved import compare_text
 from tests.netem.control.fake_relay import FakeRelay, running, times
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
@@ -109,15 +108,6 @@ def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
         all_statistics.append(statistics(snapshot, before))
         before = snapshot
     return all_statistics
-
-
-def test_a_link_is_shown_in_the_approved_lines() -> None:
-    """Words of any length, and names with brackets."""
-    relay = FakeRelay("[bold]up", "down")
-    relay.unintended["lost_in_kernel"] = 1234
-    first, *_, last = documents(relay)
-    lines = [line for document in (first, last) for line in statistics_lines(document)]
-    compare_text(Path(__file__).with_name("lines.txt"), "\n".join([*lines, ""]))
 
 
 PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()

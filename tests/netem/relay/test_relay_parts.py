@@ -54,12 +54,6 @@ def test_a_link_that_leads_back_to_itself_is_refused(listen: str, to: str) -> No
         open_and_close([link((to, port), listen=(listen, port))])
 
 
-def test_a_link_to_the_same_port_of_another_address_is_allowed() -> None:
-    for listen, to in (("127.0.0.1", "127.0.0.2"), ("0.0.0.0", "192.0.2.1")):
-        port = free_port(listen)
-        open_and_close([link((to, port), listen=(listen, port))])
-
-
 def test_links_may_form_a_chain_but_not_a_cycle() -> None:
     ports = {name: free_port(HOSTS[4]) for name in "abc"}
 

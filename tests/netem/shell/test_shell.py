@@ -2,13 +2,12 @@
 
 import json
 import os
-import resource
 import shutil
 import signal
 import socket
 import subprocess
 import sys
-from functools import cache, partial
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NoReturn
@@ -154,18 +153,6 @@ def test_a_mistake_is_one_line(words: list[str], line: str, capsys: pytest.Captu
     assert line in error
 
 
-def test_a_system_that_does_not_permit_it_is_one_line_with_the_remedy() -> None:
-    need("unshare")
-    script = 'echo 0 > /proc/sys/user/max_user_namespaces && exec "$@"'
-    command = ["unshare", "-r", "sh", "-c", script, "sh", *SHELL, "--", "true"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
-    if "cannot create" in done.stderr or "Permission denied" in done.stderr:
-        pytest.skip(done.stderr)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "`sysctl -w user.max_user_namespaces=10000`" in done.stderr
-
-
 @pytest.mark.parametrize("killed", ["relay", "guard", "both", "group", "all", "terminated"])
 def test_the_shell_leaves_no_process_behind(killed: str) -> None:
     """All of them have the pipe: its end is the end of the last one."""
@@ -223,39 +210,3 @@ def test_a_shell_on_a_host_with_many_devices_counts_its_own_drops() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [("set noack0 name other", False), ("delete noack0", True), ("set noack0 netns 1", False)],
-)
-def test_the_command_may_change_its_device(change: str, said: bool) -> None:
-    done = run("--", "sh", "-c", f"ip link set noack0 down; ip link {change}; sleep 1.5; exit 7")
-    assert "Traceback" not in done.stderr
-    assert ("the shell's device inside was deleted" in done.stderr) == said
-    assert done.returncode == 7
-
-
-def test_drops_are_those_of_the_device_of_exactly_this_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lines = [f"{name}: 0 0 0 0 0 0 0 0 0 0 0 {drops} 0 0 0 0\n" for name, drops in (
-        ("xnoack0", 5), *((f"d{k}", 9) for k in range(300)), ("  noack0", 7), ("noack01", 3),
-    )]  # fmt: skip
-    (tmp_path / "dev").write_text("Inter-|   Receive\n face |bytes\n" + "".join(lines))
-    spec = LinkSpec("relay", ("", 0), ("", 0), LinkSettings(), LinkSettings())
-    with (tmp_path / "dev").open("rb") as file:
-        link = DeviceLink(spec, (-1, -1), (file.fileno(), file.fileno()), -1, None)
-        monkeypatch.setattr(DeviceLink, "device_name", lambda self, side: ("noack0", "d1")[side])
-        assert (link.drops("forward"), link.drops("reverse")) == (7, 9)
-        monkeypatch.setattr(DeviceLink, "device_name", lambda self, side: None)
-        assert (link.drops("forward"), link.drops("reverse")) == (7, 9)  # the last ones
-
-
-def test_few_open_files_are_the_reason_that_is_given() -> None:
-    for most in range(8, 16):
-        limit = partial(resource.setrlimit, resource.RLIMIT_NOFILE, (most, most))
-        done = run("--", "true", preexec_fn=limit)
-        assert done.returncode in (0, 1)
-        assert done.returncode == 0 or f"too many open files: at most {most} are" in done.stderr
-        assert "Traceback" not in done.stderr

@@ -1,6 +1,5 @@
 """Parts of installed packages, right and wrong ones, in programs of their own."""
 
-import json
 import os
 import subprocess
 import sys
@@ -136,36 +135,6 @@ def test_an_entry_point_that_names_no_module_costs_one_line(tmp_path: Path) -> N
     output, (line,) = run(tmp_path, "-c", KINDS)
     assert "swing" not in output
     assert line.startswith("noack: warning: a part of the extension noack-swing is ignored: not a module !: ")
-
-
-def test_what_a_module_prints_is_no_part_of_a_document(tmp_path: Path) -> None:
-    module = f"print('hello')\n{PLANT.replace('KIND', 'swing')}"
-    install(tmp_path, "noack-swing", "[noack.plants]\nswing = swing_plant\n", swing_plant=module)
-    schema, lines = run(tmp_path, "-m", "cosim.cli", "schema")
-    assert "SwingSettings" in json.loads(schema)["$defs"]
-    assert lines == ["hello"]
-
-
-def test_a_scenario_of_a_package_is_listed_without_a_description_or_a_mistake_in_it(tmp_path: Path) -> None:
-    install(tmp_path, "noack-swing", "[noack.scenarios]\nswing = swing_plant\n", swing_plant="")
-    (tmp_path / "swing_plain.toml").write_text("horizon_s = 1.0\n")
-    (tmp_path / "swing_broken.toml").write_text("horizon_s = \n")
-    (tmp_path / "swing_latin.toml").write_bytes(b'description = "\xe9"\n')
-    output, warnings = run(tmp_path, "-m", "cosim.cli", "scenarios")
-    plain, broken, latin = (
-        next(line for line in output.splitlines() if line.startswith(name))
-        for name in ("swing_plain", "swing_broken", "swing_latin")
-    )
-    assert plain.split() == ["swing_plain"]
-    assert "not a TOML file: " in broken
-    assert "not a TOML file: " in latin
-    assert "lane_following" in output
-    assert warnings == []
-
-
-def test_an_entry_point_that_is_a_class_is_for_plants_in_python(tmp_path: Path) -> None:
-    install(tmp_path, "swings", "[noack.plants]\nswing = missing:Swing\n")
-    assert run(tmp_path, "-c", KINDS)[1] == []
 
 
 @pytest.mark.parametrize(("words", "package"), [

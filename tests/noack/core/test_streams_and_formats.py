@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from noack.core.core_library import CoreMemory, reals_at
-from noack.core.number_format import apart_from, at_least, at_most, counted, duration_at_least, plus_minus
+from noack.core.number_format import at_least, at_most, plus_minus
 from noack.core.random_streams import stream, stream_key, stream_keys, uniforms, words
 
 
@@ -108,27 +108,3 @@ def test_arrays_are_copies_that_live_with_their_memory() -> None:
 ])  # fmt: skip
 def test_a_bound_is_rounded_away_from_what_it_bounds(value: float | None, most: str, least: str) -> None:
     assert (at_most(value), at_least(value)) == (most, least)
-
-
-def test_a_bound_with_decimals_and_a_time() -> None:
-    assert (at_most(0.99999999901, decimals=9), at_least(1e40 / 3, decimals=1)[:3]) == ("1.000000000", "333")
-    assert at_least(0.99999999999, decimals=9) == "0.999999999"
-    assert [duration_at_least(time_s) for time_s in (0.0499999, 0.05, 1.0096, 2.5e-6)] == [
-        "49.9 ms", "50 ms", "1 s", "2.5 µs",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(2.63123, "2.63"), (1.0, "1"), (1.0000003, "1.0000003"), (0.9999, "0.9999"), (math.inf, "inf")],
-)
-def test_a_number_is_told_from_its_limit(value: float, text: str) -> None:
-    assert apart_from(1.0, value) == text
-
-
-def test_one_thing_has_no_plural() -> None:
-    assert [counted(count, "datagram") for count in (0, 1, 2000)] == [
-        "0 datagrams",
-        "1 datagram",
-        "2,000 datagrams",
-    ]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from netem.tc_words import settings_of
-from noack.impairments.burst_prediction import BurstPrediction, chance_text, predict_bursts, read_within
+from noack.impairments.burst_prediction import BurstPrediction, chance_text, predict_bursts
 from noack.impairments.target_loss import loss_process
 
 
@@ -64,11 +64,3 @@ def test_the_known_examples_and_the_mean_bursts() -> None:
 def test_chances_near_0_and_1_are_bounds() -> None:
     texts = [chance_text(chance) for chance in (0, 1e-9, 1e-4, 0.417, 0.9963, 0.999_99, 1)]
     assert texts == ["0%", "<0.001%", "0.01%", "41.7%", "99.6%", ">99.99%", "100%"]
-
-
-def test_packets_may_be_given_as_a_time() -> None:
-    assert read_within("600", None) == 600
-    assert read_within("30s", 0.05) == 600
-    for text, period_s, message in (("30s", None, "period"), ("x", 1.0, "e.g. 600"), ("0", 1.0, "1 to 10")):
-        with pytest.raises(ValueError, match=message):
-            read_within(text, period_s)

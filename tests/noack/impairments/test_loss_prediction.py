@@ -116,35 +116,6 @@ QUEUE = "as long as no queue overflows"
 OUT_OF_ORDER = "not counting packets delivered out of order (stale)"
 
 
-@pytest.mark.parametrize(
-    ("words", "note"),
-    [
-        ("loss 5% delay 10ms", ""),
-        ("loss 5% rate 1mbit codel", "as long as no queue overflows or CoDel drops"),
-        ("delay 10ms 2ms loss 5%", OUT_OF_ORDER),
-        ("delay 10ms 2ms mansd 0", ""),
-        ("delay 0 samples 1ms,2ms", OUT_OF_ORDER),
-        ("delay 10ms reorder 5%", OUT_OF_ORDER),
-        ("delay 10ms reorder 0%", ""),
-        ("delay 0 reorder 5%", ""),
-        ("rate 1mbit reorder 5%", f"{QUEUE}; {OUT_OF_ORDER}"),
-        ("delay 10ms 2ms reorder 5% rate 1mbit", QUEUE),
-        ("rate 1mbit delay 10ms 2ms", f"{QUEUE}; {OUT_OF_ORDER}"),
-    ],
-)
-def test_the_note_states_what_the_prediction_excludes(words: str, note: str) -> None:
-    assert predict(settings_of(words)).note == note
-    assert makes_stale(settings_of(words)) == (OUT_OF_ORDER in note)
-
-
-def makes_stale(settings: LinkSettings) -> bool:
-    """Whether one of 2000 datagrams, 10 µs apart, leaves before an earlier one."""
-    link = Link(settings, 1, "test")
-    leaves_ns = [link.decide(0, 100, 10_000 * packet).release_ns for packet in range(2000)]
-    left_ns = [t_ns for t_ns in leaves_ns if t_ns >= 0]
-    return left_ns != sorted(left_ns)
-
-
 P = 0.3
 INDEPENDENT = {"kind": "loss", "loss": {"model": "bernoulli", "probability": P}}
 BURSTY = {
@@ -243,14 +214,3 @@ def test_losses_are_not_predicted_if_few_packets_may_be_delayed_at_once() -> Non
         link.handle(Datagram(0, bytes(72)), t_ns)
         link.on_timer(t_ns)
     assert link.counters.corrupted == pytest.approx(500, abs=60)
-
-
-def test_losses_of_which_no_rate_can_be_kept_have_no_prediction() -> None:
-    kept = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.1, "keep": True}}
-    with pytest.raises(NotPredictableError, match="10%"):
-        process(kept, {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.8}})
-
-
-def test_losses_that_depend_on_times_have_no_prediction() -> None:
-    with pytest.raises(NotPredictableError):
-        process(INDEPENDENT, {"kind": "delay", "delay_s": 0.1, "jitter_s": 0.05})

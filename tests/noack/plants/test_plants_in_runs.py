@@ -1,9 +1,7 @@
 """Runs with a user's plant, a class: stored, replayed, failed, refused."""
 
-import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from cosim.simulation.virtual_time import simulate_run
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.scenario_file import load
-from tests.helpers.command_line import invoke
 
 PLANT_SCENARIO = """
 name = "own"
@@ -96,22 +93,3 @@ def test_a_failed_plant_stops_moving_and_the_run_is_recorded(tmp_path: Path) -> 
     (loop,) = outcome.summary.loops
     assert loop.rejected_datagrams["sensor"]["not_finite"] > 0
     assert loop.unintended_losses == 0  # what is rejected has arrived
-
-
-def test_check_describes_the_plant_and_refuses_invalid_settings(tmp_path: Path) -> None:
-    path = prepared(tmp_path, PYTHON, "{}")
-    done = invoke("check", path)
-    assert done.exit_code == 0
-    assert "the plant: class VanDerPol of mine.py" in " ".join(done.stdout.split())
-    done = invoke("check", path, "--json")
-    system: dict[str, Any] = json.loads(done.stdout)["plant"]["system"]
-    assert (system["kind"], len(system["sha256"])) == ("python", 64)
-    for wrong, expected in (
-        ('{ kind = "python", name = "a b" }', "use an entry point's name, or package.module:Class"),
-        (f'{{ kind = "python", name = "a", sha256 = "{64 * "0"}" }}', "give file, too"),
-        ('{ kind = "python", file = ".", name = "a" }', "cannot be read: not a regular file"),
-    ):
-        path.write_text(PLANT_SCENARIO.replace("SYSTEM", wrong).replace("PARAMETERS", "{}"))
-        with pytest.raises(CallerError) as refused:
-            load(path)
-        assert expected in str(refused.value)

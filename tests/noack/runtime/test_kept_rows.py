@@ -6,11 +6,10 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.core.errors import CallerError, NoackError, PeerError
+from noack.core.errors import NoackError
 from noack.runtime.kept_rows import KeptFile, KeptHead, read_kept
 
 HEAD = KeptHead(run="0001", process="sensor", secret="s")
@@ -46,14 +45,6 @@ def test_what_two_runs_with_one_directory_keep_stays_apart(tmp_path: Path) -> No
     other = kept(tmp_path / "run", HEAD.model_copy(update={"run": "0002"}))
     assert other.path.name == "sensor-0002.spool"
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"sensor.spool", "sensor-0002.spool"}
-
-
-def test_a_missing_file_and_one_of_others_are_named(tmp_path: Path) -> None:
-    with pytest.raises(CallerError, match="cannot be read: No such file or directory"):
-        read_kept(tmp_path / "sensor.spool")
-    (tmp_path / "other").write_bytes(b"\x89PNG")
-    with pytest.raises(PeerError, match="not a file of rows that a process kept"):
-        read_kept(tmp_path / "other")
 
 
 @given(st.integers(0, 400), st.binary(max_size=8), st.booleans())

@@ -1,6 +1,5 @@
 """Matrices from files, and from objects of python-control and SciPy."""
 
-import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,8 +10,6 @@ from scipy import signal
 from scipy.io import loadmat, savemat
 from scipy.sparse import csc_matrix
 
-from noack.core.errors import CallerError
-from noack.scenario import matrix_files
 from noack.scenario.matrix_files import model_of, save_model
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -102,17 +99,6 @@ def test_a_wrong_file_or_key_is_refused_with_the_approved_lines(tmp_path: Path) 
     compare_lines(Path(__file__).with_name("matrix_mistakes.txt"), refusal)
 
 
-def test_a_file_of_very_many_arrays_is_refused_before_any_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with zipfile.ZipFile(tmp_path / "m.npz", "w") as archive:
-        for number in range(1_001):
-            archive.writestr(f"a{number}.npy", b"")
-    monkeypatch.setattr(matrix_files, "_npz_arrays", lambda content: pytest.fail("it was read"))
-    with pytest.raises(CallerError, match=r"has 1,001 arrays; at most 1,000 are read"):
-        scenario(tmp_path, 'file = "m.npz"')
-
-
 C, D = np.eye(2), np.zeros((2, 1))
 EXPECTED = ModelSection(A=((0.0, 1.0), (4.0, -0.25)), B=((0.0,), (1.0,)), gain=((-8.0, -4.0),))
 
@@ -144,28 +130,3 @@ def test_a_saved_system_is_read_back(suffix: str, read: Any, tmp_path: Path) -> 
         assert np.array_equal(matrices[name], expected)
     save_model(path, (A, B))
     assert "gain" not in read(path)
-
-
-@pytest.mark.parametrize(
-    ("system", "gain", "expected"),
-    [
-        (signal.StateSpace(A, B, C, D, dt=0.1), K, "dt is 0.1, so it is a system in discrete time"),
-        (signal.TransferFunction([1.0], [1.0, 2.0]), K, "TransferFunctionContinuous has no A"),
-        (control_object(dt=True), K, "discrete time; the loop is in continuous time (MATLAB: d2c)"),
-        ((A, B, C), K, "a tuple of 3"),
-        ((A[:1], B), K, "expected 2 x 2 (B has a row for each state), found 1 x 2"),
-        ((A, B), -K, "u = -K x does: give -K"),
-        ((A, B[:, 0]), K, "B: a matrix of finite numbers is needed"),
-        ((A, "B"), K, "B: is not a matrix of real numbers"),
-    ],
-)
-def test_an_invalid_system_is_refused_in_one_line(system: Any, gain: Any, expected: str) -> None:
-    (line,) = lines_of_error(lambda: model_of(system, gain))
-    assert expected in line
-
-
-def test_a_wrong_file_type_or_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CallerError, match=r"must end in \.npz"):
-        save_model(tmp_path / "plant.csv", (A, B))
-    with pytest.raises(CallerError, match="cannot be written"):
-        save_model(tmp_path / "nowhere" / "plant.npz", (A, B))

@@ -19,7 +19,6 @@ from noack.core.errors import CallerError
 from noack.scenario import toml_file
 from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario_file import dumps, load, put, validate, value_of
-from noack.settings.section import ScenarioSection
 from tests.helpers.approved import compare_lines
 
 SHIPPED = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
@@ -115,17 +114,6 @@ def test_invalid_toml_is_reported_with_its_line(tmp_path: Path) -> None:
         Path(__file__).with_name("toml_mistakes.txt"),
         lambda text: mistakes_with(json.loads(text), tmp_path, ()),
     )
-
-
-def test_a_setting_names_an_entry_of_a_list(tmp_path: Path) -> None:
-    path = tmp_path / "scenario.toml"
-    path.write_text(LANE + '[[loops]]\nname = "a"\n[[loops]]\nname = "b"\n')
-    scenario = load(path, ["plant.initial_state.2=0.5", "loops.1.mode=zoh", "loops.1.name=c"])
-    assert scenario.plant.initial_state[2] == 0.5
-    assert scenario.loops is not None
-    assert [(loop.name, loop.mode) for loop in scenario.loops] == [("a", None), ("c", "zoh")]
-    with pytest.raises(CallerError, match=r"^--set loops\.1\.name = .a.: the name a is already"):
-        load(path, ["loops.1.name=a"])
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -247,34 +235,3 @@ def test_every_reader_refuses_large_files_deep_tables_and_long_integers(
     path.write_text(f"link = 1\naxes = 1\nmodel = 1\n{text}")  # as each reader expects
     with pytest.raises(CallerError, match=f"^[^\n]*file.toml: {wrong}[^\n]*$"):
         read(path)
-
-
-def test_the_key_of_a_setting_has_a_maximum_length() -> None:
-    content: dict[str, object] = {}
-    put(content, key(MOST), 1, "--set")
-    with pytest.raises(CallerError, match=r"^--set: the key has more than 32 parts$"):
-        put(content, key(MOST + 1), 1, "--set")
-
-
-def test_the_number_of_further_mistakes_is_given() -> None:
-    with pytest.raises(CallerError) as caught:
-        validate({f"a{i}": 0 for i in range(100)}, "here")
-    lines = str(caught.value).splitlines()
-    assert len(lines) == 51
-    assert lines[-1] == "here: 56 more mistakes"  # 6 required keys are missing, too
-
-
-class _Named(ScenarioSection):
-    name: str
-    note: str = ""
-
-
-def test_a_missing_file_suggests_only_files_of_its_type(tmp_path: Path) -> None:
-    (tmp_path / "one.toml").write_text("name = 'one'\nmore = 1")
-    (tmp_path / "nine.toml").write_text("name = ")
-    (tmp_path / "tone.toml").write_text("[project]\nname = 'other'")
-    os.mkfifo(tmp_path / "nose.toml")
-    with pytest.raises(CallerError) as caught:
-        toml_file.read(tmp_path / "none.toml", _Named)
-    near = f"did you mean {tmp_path}/one.toml?"
-    assert str(caught.value) == f"{tmp_path}/none.toml: no such file; {near}"

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from cosim.live.processes.child_processes import MODULES, ChildProcesses
-from noack.core.errors import ExitStatus, MachineError
+from noack.core.errors import ExitStatus
 from noack.protocol.roles import LOOP_ROLES
 from tests.helpers.waiting import wait_for
 
@@ -150,23 +150,9 @@ def test_a_process_has_the_environment_and_the_folder_of_its_launcher(
         monkeypatch.delenv(name)
 
 
-@pytest.mark.parametrize("fork", [False, True])
-def test_a_process_that_cannot_be_started_is_an_error(tmp_path: Path, fork: bool) -> None:
-    with pytest.raises(MachineError, match=r"^plant cannot be started: No such file"):
-        ChildProcesses(tmp_path / "missing", ["plant"], fork=fork).start()
-
-
 def test_another_user_cannot_reach_the_fork_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multiprocessing.util, "abstract_sockets_supported", True)
     with started(tmp_path, "plant"):
         address = multiprocessing.forkserver._forkserver._forkserver_address  # type: ignore[attr-defined]
         assert stat.S_IMODE(Path(address).parent.stat().st_mode) == 0o700
     assert not multiprocessing.util.abstract_sockets_supported
-
-
-def test_a_fork_server_that_cannot_be_started_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "logs").mkdir()
-    program = f"import sys; sys.executable = '/nowhere'\n{_OF_PROGRAM}"
-    command = [sys.executable, "-c", program, str(tmp_path)]
-    result = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=150)
-    assert "MachineError: plant cannot be started: " in result.stderr.splitlines()[-1]

@@ -4,19 +4,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from cosim.output.viewer.network_diagram import LEG_S, NetworkDiagram
 from cosim.output.viewer.pictures.lane_picture import LanePicture
 from cosim.output.viewer.pictures.pendulum_picture import PendulumPicture
 from cosim.output.viewer.pictures.phase_picture import PhasePicture
-from cosim.output.viewer.pictures.picture import WHO, Columns, Frames, Picture, panel, picture_of
+from cosim.output.viewer.pictures.picture import WHO, Columns, Frames, Picture, panel
 from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
 from cosim.output.viewer.pictures.tanks_picture import TanksPicture
-from noack.core.linear_systems import Propagator
 from noack.protocol.record_tables import Fate
-from noack.scenario.resolution import loop_of
-from tests.helpers.shipped import resolved
 
 S = 1_000_000_000
 PICTURES: dict[str, tuple[Picture, int, int]] = {
@@ -46,14 +42,6 @@ def arrays(columns: Columns) -> dict[str, list[Any]]:
     }
 
 
-def pose(columns: Columns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions (k, 2) with +y upwards, and counterclockwise rotation angles (k,) of a shape."""
-    values = arrays(columns)
-    place = np.array(values["translation"], dtype=float)[:, 0, :2] * (1, -1)
-    quaternion = np.array(values.get("quaternion", [[(0, 0, 0, 1)]] * len(place)))[:, 0, :]
-    return place, -2 * np.arctan2(quaternion[:, 2], quaternion[:, 3])
-
-
 @pytest.mark.parametrize("name", PICTURES)
 def test_every_moving_shape_has_a_position_in_every_frame(name: str) -> None:
     picture, n, internal = PICTURES[name]
@@ -73,27 +61,6 @@ def test_every_moving_shape_has_a_position_in_every_frame(name: str) -> None:
     for who in WHO:
         assert any(who in entity.split("/") for entity in moving_shapes), who
     assert picture.rate_hz <= 60
-
-
-def test_the_car_is_drawn_in_its_direction_of_travel() -> None:
-    """Without sideslip, the nose points along the path over the ground in the picture."""
-    scenario = resolved("lane_following")
-    loop, picture = loop_of(scenario), picture_of(scenario)
-    t_s = np.arange(600) / 60
-    advance = Propagator(loop.A_model + loop.B_model @ loop.K).transition(round(S / 60))
-    x = [loop.x0]
-    while len(x) < len(t_s):
-        x.append(advance @ x[-1])
-    states = np.array(x)
-    moving_shapes = picture.frames(Frames(t_s, states, states, states))
-    place, angle = pose(moving_shapes["plant"])
-    # The markings are fixed to the ground, up to whole periods.
-    passed_m = -np.unwrap(pose(moving_shapes["road/passing"])[0][:, 0], period=18.0)
-    speed = 12.0
-    np.testing.assert_allclose(np.diff(passed_m) * 60, speed, rtol=1e-3)
-    slope = np.gradient(place[:, 1], passed_m)
-    sideslip = states[:, 0] / speed
-    np.testing.assert_allclose(slope[1:-1], (angle + sideslip)[1:-1], atol=2e-3)
 
 
 def rows_of(diagram: NetworkDiagram, ends_ns: list[int]) -> dict[str, dict[int, list[Any]]]:

@@ -1,6 +1,5 @@
 """Certificates of nonlinear plants on regions: enclosures, attacks on the shipped ones, reasons."""
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -35,10 +34,6 @@ REGIONS = {
     "four tanks": [4.0, 4.0, 1.2, 0.9, 2.0, 2.0],
 }
 LUENBERGER = LuenbergerSettings(kind="luenberger", gain=((0.2, 0.0), (0.0, 0.2)))
-STEEP = """class Steep:
-    def derivative(self, t_s, z, u):
-        return [z[1], z[0] + z[0] ** 7 + u[0]]
-"""
 
 
 def over(resolved: Scenario, widths: Vector) -> Inclusion:
@@ -168,56 +163,11 @@ def own_plant(folder: Path, code: str) -> Scenario:
     return resolve(load(folder / "own.toml"))
 
 
-@pytest.mark.parametrize(
-    ("body", "reason"),
-    [
-        (
-            "return [z[1], math.sin(z[0]) + u[0]]",
-            "needs numpy's functions: np.sin, not math.sin (own.py, line 4)",
-        ),
-        ("return [z[1], z[0] + u[0] if z[0] > 0 else u[0]]", "distinguish cases"),
-        ("return [z[1], z[0] + u[0] + (t_s > 1)]", "distinguish cases"),
-        ("return [z[1], z[0] + u[0] + 0.1]", "does not rest"),
-        ("return [z[1], np.sqrt(z[0]) + u[0]]", "not defined and smooth"),
-        ("return [z[1], np.hypot(z[0], 1.0) - 1 + u[0]]", "np.hypot has no enclosure; sin, cos"),
-    ],
-)
-def test_without_a_certificate_the_reason_is_given(tmp_path: Path, body: str, reason: str) -> None:
-    code = "class Own:\n    def derivative(self, t_s, z, u):\n        import math, numpy as np\n"
-    code += f"        {body}\n"
-    assert reason in (certificate_of(own_plant(tmp_path, code), (0.1, 0.1)).void or "")
-
-
 FRICTION = """class Rubbing:
     def derivative(self, t_s, z, u):
         import numpy as np
         return [z[1], z[0] + u[0] - 0.01 * {term}]
 """
-
-
-@pytest.mark.parametrize("term", ["np.tanh(z[1] / 0.05)", "np.arctan(z[1] / 0.05)", "10 * z[1] * abs(z[1])"])
-def test_friction_is_certified_far_from_its_bend(tmp_path: Path, term: str) -> None:
-    assert certificate_of(own_plant(tmp_path, FRICTION.format(term=term)), (1.0, 0.1)).void is None
-
-
-@pytest.mark.parametrize(
-    ("term", "reason"),
-    [
-        ("-3000 * z[0] ** 3", "the slope of dx_2/dt by x_1 is from"),
-        ("(z[1] if abs(z[0]) < 0.5 else 0.0)", "distinguish cases"),
-    ],
-)
-def test_a_start_too_far_away_is_named(tmp_path: Path, term: str, reason: str) -> None:
-    """With the region that the bounds need, and the one on which the equations are near enough to linear."""
-    void = certificate_of(own_plant(tmp_path, FRICTION.format(term=term)), (1.0, 0.1)).void
-    assert void is not None
-    assert reason in void
-    found = re.search(
-        r"it is not so on \|x_1\| ≤ ([\d.]+), .* does not contain the start: \|x_1\| ≤ \1", void
-    )
-    assert found
-    nearer = certificate_of(own_plant(tmp_path, FRICTION.format(term=term)), (0.01, 0.01))
-    assert nearer.void is None
 
 
 def test_linear_equations_have_the_certificates_of_a_linear_plant(tmp_path: Path) -> None:
@@ -245,16 +195,6 @@ def test_equations_that_are_linear_near_0_only_are_not_linear(tmp_path: Path) ->
     for term in ("max(z[1] - 1e3, 0.0)", "1e-9 * z[1] ** 2", "np.sin(1e-6 * z[1])"):
         own = own_plant(tmp_path, FRICTION.format(term=term))
         assert isinstance(nonlinear_scope(own), RegionScope)
-
-
-@pytest.mark.parametrize(("rest", "status"), [(0.0, "holds"), (1e-10, "assumed")])
-def test_what_the_bounds_leave_out_is_named(tmp_path: Path, rest: float, status: str) -> None:
-    own = own_plant(tmp_path, STEEP.replace("u[0]", f"u[0] + {rest}"))
-    certificate = certificate_of(own, (0.01, 0.01))
-    assert certificate.void is None
-    [rests] = [assumption for assumption in certificate.assumptions if "rests at" in assumption.what]
-    assert rests.verdict.value == status
-    assert (f"at most {rest:.2g} there" in rests.why) == (rest > 0)
 
 
 def test_a_run_is_held_against_its_region() -> None:

@@ -4,12 +4,10 @@ tests/cosim/analysis/claims compares ``nominal_conditions`` with the machines.
 """
 
 import math
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -18,11 +16,11 @@ from noack.core.linear_systems import spectral_abscissa
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
-from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
+from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
-from noack.theory.certificates.scenario_certificates import box_scope, certify, certify_box, own_plant_scope
+from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
+from noack.theory.certificates.scenario_certificates import box_scope, certify, own_plant_scope
 from tests.noack.theory.certificates.certificate_kinds.policies import exceeded_by, scenario_with
 from tests.noack.theory.certificates.certified_loops import conditions_of
 from tests.oracles.lossy_loops import SEARCH, STEPS, System, Trace, networks, seeds, simulate, systems
@@ -49,18 +47,6 @@ def certified(system: System, floor: float = 0.0) -> tuple[ScenarioCertificate, 
 
 def run(system: System, seed: int, floor: float = 0.0) -> Trace:
     return simulate(system, *networks(seed, system), floor=floor)
-
-
-@pytest.mark.parametrize("mansd", [5000, 1_000_000])
-def test_what_would_take_minutes_is_refused_with_its_reason(
-    mansd: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nothing is computed that grows with the number of missing updates."""
-    monkeypatch.setattr("noack.theory.certificates.error_rows.sum_of_sups", None)
-    resolved = shipped("double_integrator", f"network.mansd={mansd}")
-    void = certify(resolved, nominal_conditions(resolved)).void
-    assert void is not None
-    assert re.match(r"up to [\d,]+ updates may be missing at once, .* for at most 1,000", void)
 
 
 LATE_INPUT = systems(hold_steps=4, lag_steps=2, step_share=0.03, beta=0.01)
@@ -106,27 +92,6 @@ def test_a_hold_under_the_papers_conditions_misses_m_thresholds() -> None:
     assert constants is not None
     assert constants.delta == pytest.approx(5.0, rel=1e-9)
     assert constants.overshoot == pytest.approx(1.0, rel=1e-12)
-
-
-def test_a_void_certificate_gives_the_reason_and_no_bounds() -> None:
-    no_gain = ["model.gain=[[0,0,0,0],[0,0,0,0]]", "model.allow_unstable=true"]
-    resolved = shipped("lane_following", *no_gain)
-    certificate = certify(resolved, ideal_conditions(resolved))
-    assert certificate.constants is None
-    assert "grows" in str(certificate.void)
-    assert certificate.inter_event_s is None
-    observed = shipped("pendulum_observed", "plant.uncertainty_A=[[0, 0], [0, 0.1]]")
-    boxed = certify_box(observed, allowed_conditions(observed))
-    assert boxed is not None
-    assert "for one plant only, not for a box" in (boxed.void or "")
-    for envelope in (certificate.sensor_error, certificate.controller_error, certificate.state):
-        assert np.isnan(envelope(np.linspace(0, 9, 4))).all()
-    assert (certificate.assumptions[-2].what, certificate.assumptions[-2].verdict) == (
-        "condition of the certificate", AssumptionStatus.VIOLATED,
-    )  # fmt: skip
-    assert "not below 1" in str(certify(shipped(), NetworkConditions(4, 0.5, 0.5)).void)
-    enormous = shipped("lane_following", "trigger.beta=1e308")
-    assert "too large for floating point" in str(certify(enormous, ideal_conditions(enormous)).void)
 
 
 @pytest.mark.parametrize("late_periods", [0, 2])
