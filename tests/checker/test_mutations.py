@@ -330,7 +330,13 @@ def mutated_loop(name: str, change: str, seed: int) -> bool:
     return is_true_or_rejected(LOOPS[change](loop, np.random.default_rng(seed)), document, seed)
 
 
-@pytest.mark.parametrize("name", NAMES)
+SEARCHED_LONG = {"later", "observed"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.system if name in SEARCHED_LONG else ()) for name in NAMES],
+)
 def test_the_documents_are_true(name: str) -> None:
     loop, document = base(name)
     assert not is_true_or_rejected(loop, document, 0)

@@ -1,10 +1,14 @@
 """A link that must overflow is refused; certificates need a stated delay where a queue is."""
 
 import re
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+import noack
+from noack.core.errors import CallerError
 from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.overload import refuse_overload
 from noack.scenario.resolution import resolve
@@ -128,3 +132,14 @@ def test_with_a_queue_a_certificate_needs_a_stated_delay() -> None:
         if void is not None:
             assert void.startswith("certificate.network_delay_s: state the largest delay")
             assert "network.impairments.1" in void
+
+
+@pytest.mark.parametrize("run", [noack.simulate, noack.run])
+def test_no_run_is_made_of_a_scenario_object_with_overload(
+    run: Callable[..., object], content: dict[str, Any], tmp_path: Path
+) -> None:
+    """One that was loaded from no file, or changed afterwards."""
+    scenario = scenario_of(content, 1000, 5, {"name": "a", "trigger": PERIODIC})
+    with pytest.raises(CallerError, match="the queue would grow without bound"):
+        run(scenario, runs=tmp_path / "runs")
+    assert not list(tmp_path.glob("runs/*"))

@@ -419,3 +419,36 @@ def test_every_datagram_is_found_again(
         assert str(datagram.flow) == (
             f"{source}:{expected.source_port} → {destination}:{expected.destination_port} on {leg}"
         )
+
+
+def test_captures_that_do_not_show_what_was_lost_are_refused() -> None:
+    sent, arrived, _ = network()
+    same = [packet._replace(payload=b"same") for packet in sent]
+    for files, message in (
+        ([pcap_of(*same), pcap_of(*arrived)], "199 of 200 datagrams have the payload of another"),
+        ([pcap_of(*sent), pcap_of(*same)], "none of the datagrams"),
+        ([pcap_of(*sent, snap_bytes=30)], "has one end only"),
+        ([pcap_of(*sent)], "has one end only"),
+        ([pcap_of()], "has no UDP datagrams"),
+        ([pcap_of(*sent, link_type=101)[:-3]], "has one end only"),
+        ([b"\n\r\r\n\0\0\0\0"], "has no UDP datagrams: the capture is cut off before the end"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            trace_of(*files)
+
+
+def test_captures_in_the_wrong_order_are_refused() -> None:
+    sender, receiver = pcap_of(*on_leg(0)), pcap_of(*on_leg(9, LOST))
+    assert trace_of(sender, receiver).lost.sum() == len(LOST)
+    with pytest.raises(ValueError, match="wrong order"):
+        trace_of(receiver, sender)
+    # With duplicates, too.
+    arrived = on_leg(9, LOST)
+    twice = sorted([*arrived, *(packet._replace(t_ns=packet.t_ns + 50) for packet in arrived[::5])])
+    with pytest.raises(ValueError, match="wrong order"):
+        trace_of(pcap_of(*twice), sender)
+    twice = sorted([*on_leg(0), *(packet._replace(t_ns=packet.t_ns + 50) for packet in on_leg(0)[::5])])
+    with pytest.raises(ValueError, match=r"payload of another one.*wrong order"):
+        trace_of(pcap_of(*twice), sender)
+    # Fewer than 1 % may be a gap in the sender's capture.
+    assert any("wrong order" in line for line in trace_of(pcap_of(*on_leg(9, [7, 8])), sender).notes)

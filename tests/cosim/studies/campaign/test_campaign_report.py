@@ -6,6 +6,8 @@ from typing import Any
 
 import pytest
 
+from cosim.output.result_tables import ResultTable
+from cosim.output.terminal_writer import without_constants
 from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import base_of
@@ -60,3 +62,14 @@ def test_the_page_is_one_file_and_escapes_user_text(write: Write, plan: dict[str
     assert "http" not in html.replace('"http-equiv', "").replace("http-equiv=", "")
     assert html.count("<figure id=") == len(campaign.figures)
     assert html.count("<svg") == len(campaign.figures)
+
+
+def test_columns_that_are_the_same_at_all_points_are_named_once() -> None:
+    rows = [("MB", "0.1", "3 ± 1", "–"), ("MB", "0.5", "4 ± 1", "–")]
+    full = ResultTable("campaign", "c", ("policy", "β", "cost", "bound used"), rows)
+    table, names = without_constants(full, 2)
+    assert (table.caption, names) == ("c; everywhere policy MB, bound used –", 1)
+    assert (table.headings, table.rows) == (["β", "cost"], [["0.1", "3 ± 1"], ["0.5", "4 ± 1"]])
+    only_labels = full._replace(rows=[("MB", "0.1", "3", "–"), ("MB", "0.5", "3", "–")])
+    for unchanged in (full._replace(rows=rows[:1]), only_labels, full._replace(rows=[])):
+        assert without_constants(unchanged, 2) == (unchanged, 2)
