@@ -15,7 +15,6 @@ from noack.traces.sequence_numbers import find_packets
 from tests.oracles.capture_files import Sent, pcap_of
 
 T_NS, PERIOD_NS = 1_700_000_000 * 10**9, 20_000_000
-ORDERS = ["big", "little"]
 
 
 def capture(
@@ -50,9 +49,8 @@ def lost_of(packets: Sequence[int]) -> list[int]:
     )
 
 
-@pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("size_bytes", range(1, 9))
-@pytest.mark.parametrize("gap", [1, 100, 127, 128, 200, 255, 256, 300, 1000, 33_000, 70_000])
+@pytest.mark.parametrize(("size_bytes", "order"), [(1, "big"), (2, "little"), (3, "big"), (8, "little")])
+@pytest.mark.parametrize("gap", [1, 127, 128, 255, 256, 33_000, 70_000])
 def test_a_gap_of_any_length_is_counted_exactly(gap: int, size_bytes: int, order: str) -> None:
     packets = [k for k in range(600 + gap) if not 300 <= k < 300 + gap]
     trace = trace_of(capture(packets, size_bytes, order=order, jitter=0.5), size_bytes, order)
@@ -71,7 +69,7 @@ def test_numbers_may_be_large_and_wrap_around(size_bytes: int, first: int) -> No
     assert np.flatnonzero(trace.lost).tolist() == lost_of(packets)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(15))
 def test_any_losses_are_counted_exactly(seed: int) -> None:
     rng = random.Random(seed)
     size_bytes, period_ns = rng.choice([1, 1, 2, 3, 4, 8]), rng.choice([10**6, 5 * 10**6, PERIOD_NS, 10**8])
