@@ -152,3 +152,16 @@ def test_ctrl_c_leaves_what_was_decided(monkeypatch: pytest.MonkeyPatch, json_ou
         assert document["period"] is None
     else:
         assert "proven stable for every loss pattern with M ≤ 2" in result.stdout
+
+
+def test_no_longest_time_between_updates_is_below_the_least_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There the loop is examined with equal times only, not with all up to the longest one."""
+    unstable = Stability(1.1, 1.2, (True,), (0.2,), 0)
+    monkeypatch.setattr(LossMargin, "coarse_bounds", lambda _: unstable)
+    rule = {"policy": "dwell", "interval_s": 0.2, "rule": {"policy": "absolute", "delta": 0.1}}
+    trigger = {"policy": "deadline", "interval_s": 0.8, "rule": rule}
+    scenario = noack.load("double_integrator", {"trigger": trigger, "plant.measure_every": 10})
+    limit = find_longest_period(resolve(scenario))
+    assert limit.is_longest
+    assert limit.stable_s is None
+    assert limit.unstable_s == pytest.approx(0.2)
