@@ -20,12 +20,12 @@ from cosim.analysis.summary.loops_over_time import LoopOverTime, loop_over_time
 from cosim.analysis.summary.plant_linearisation import linearisation
 from cosim.analysis.summary.run_summary import Outcome, summarise_run
 from cosim.analysis.summary.summary_model import (
+    AllowedConditionsPart,
     ConditionsPart,
     ExitPart,
     LoopSummary,
     ReplayPart,
     RunSummary,
-    SchedulePart,
     read_summary,
 )
 from cosim.live.monitoring.progress import work_bar
@@ -302,8 +302,8 @@ def _claim_results(claims: RunClaims, summary: LoopSummary) -> dict[str, Any]:
         longest = max(longest, int(claims.conditions["dropouts"] or 0))
     return {
         "conditions": ConditionsPart(**claims.conditions),
-        "allowed": _schedule(claims.allowed),
-        "certified_for": _schedule(claims.certified_for),
+        "allowed": _allowed(claims.allowed),
+        "certified_for": _allowed(claims.certified_for),
         "claims": claims.evaluate(),
         "judged_until_s": claims.judged_until_s,
         "assumption_violations": list_violations(summary.assumption_violations, claims.violations()),
@@ -311,10 +311,12 @@ def _claim_results(claims: RunClaims, summary: LoopSummary) -> dict[str, Any]:
     }
 
 
-def _schedule(conditions: NetworkConditions | None) -> SchedulePart | None:
+def _allowed(conditions: NetworkConditions | None) -> AllowedConditionsPart | None:
     if conditions is None:
         return None
-    return SchedulePart(**{name: getattr(conditions, name) for name in SchedulePart.model_fields})
+    return AllowedConditionsPart(
+        **{name: getattr(conditions, name) for name in AllowedConditionsPart.model_fields}
+    )
 
 
 def _replay(record: RunRecord, shared: SharedMachines | None = None) -> ReplayPart:

@@ -284,7 +284,7 @@ class RunEvidence:
 
         The record is incomplete, or the error of a process's clock is not bounded as required.
         """
-        limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
+        limit = _ANY._replace(sampling_s=self._nominal.sampling_s)
         gaps = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
         whole_record = self.whole_record or self.record
         end_ns = common_end_ns(whole_record)
@@ -311,8 +311,8 @@ class RunEvidence:
     @cached_property
     def paper_violation(self) -> VoidFrom | None:
         """First violation of the guarantee or of u = K x_c, which the paper's theorems assume."""
-        schedule, rules = self._schedule, guarantee_causes(self.record.scenario)
-        limit = _ANY._replace(dropouts=schedule.dropouts, constraints=schedule.constraints)
+        nominal, rules = self._nominal, guarantee_causes(self.record.scenario)
+        limit = _ANY._replace(dropouts=nominal.dropouts, constraints=nominal.constraints)
         causes = (*rules, "watchdog", "safe input")
         return earliest([self.observed.first_violation(limit, causes), self.first_gap])
 
@@ -350,7 +350,7 @@ class RunEvidence:
         return allowed if self.start_error is None else allowed._replace(start_s=0.0)
 
     @cached_property
-    def _schedule(self) -> NetworkConditions:
+    def _nominal(self) -> NetworkConditions:
         scenario, is_allowed = self.record.scenario, self.start_error is None
         is_allowed &= not scenario.certificate.late_periods
         return self.allowed if is_allowed else nominal_conditions(scenario)

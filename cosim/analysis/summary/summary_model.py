@@ -306,7 +306,7 @@ class ConditionsPart(SummaryPart):
     clock_error_s: Real = None
 
 
-class SchedulePart(SummaryPart):
+class AllowedConditionsPart(SummaryPart):
     """Times that are allowed, or that a certificate covers, as in :class:`ConditionsPart`."""
 
     sampling_s: float
@@ -406,9 +406,9 @@ class LoopSummary(SummaryPart):
     linearisation: LinearisationPart | NoLinearisationPart | None = None
     ideal_loop: IdealLoopPart | NoIdealLoopPart | None = None
     conditions: ConditionsPart | None = None
-    allowed: SchedulePart | None = None
+    allowed: AllowedConditionsPart | None = None
     """The schedule that the scenario allows; None where there are no certificates."""
-    certified_for: SchedulePart | None = None
+    certified_for: AllowedConditionsPart | None = None
     """The schedule that the certificates cover, if the run was later than its scenario allows."""
     claims: list[Claim] = []
     judged_until_s: Real = None
