@@ -23,7 +23,7 @@ _WIDER, _MOST_REGIONS = 1.03, 12
 _LAST_WIDER, _LAST_TRIES = 1.06, 3
 _LEAST = 1e-3
 """Least width of a region in each direction, as a share of its largest."""
-_SAME = 1e-6
+_SAME = 1e-5
 _TIGHT = 0.8
 """A region whose bounds are all below this share of it is replaced by a smaller one."""
 _EXPECTED = 40
@@ -65,20 +65,9 @@ def find_region_witness(
     effort.expect(_EXPECTED)
     restricted = _restricted(plant)
     coordinates = [_output(plant, k) for k in restricted]
-    widths = _with(plant, restricted, _FIRST * plant.typical[restricted])
-    reached, shares = np.zeros(len(restricted)), Shares()
-    for _ in range(_MOST_REGIONS if restricted else 0):
-        last, reached = reached, _reached(plant, widths, coordinates, effort, shares)
-        if (reached < widths[restricted]).all():
-            if (reached > _TIGHT * widths[restricted]).any():
-                break
-            widths = _with(plant, restricted, _WIDER * reached)  # inside it the bounds are not larger
-            continue
-        grown = _WIDER * _extrapolated(last, reached, widths[restricted])
-        widths = _with(plant, restricted, np.maximum(grown, _LEAST * grown.max()))
-    else:
-        if restricted:
-            raise NoWitnessError(f"{_described(plant, widths)}: the bounds are not within it")
+    widths = (
+        _own_bounds_inside(plant, restricted, effort) if restricted else np.full_like(plant.typical, np.inf)
+    )
     why: NoWitnessError | None = None
     for _ in range(_LAST_TRIES):
         try:
@@ -88,6 +77,36 @@ def find_region_witness(
         except NoWitnessError as error:
             why, widths = error, _LAST_WIDER * widths
     raise NoWitnessError(f"{_described(plant, widths)}: {why}")
+
+
+def _own_bounds_inside(plant: PlantOnRegions, restricted: Sequence[int], effort: Effort) -> Vector:
+    """Return a region that contains the rough bounds that follow from it.
+
+    Raises:
+        NoWitnessError: none is found; the message names the region that the bounds from x(0) need.
+    """
+    coordinates = [_output(plant, k) for k in restricted]
+    widths = _with(plant, restricted, _FIRST * plant.typical[restricted])
+    reached, shares = np.zeros(len(restricted)), Shares()
+    for attempt in range(_MOST_REGIONS):
+        try:
+            last, reached = reached, _reached(plant, widths, coordinates, effort, shares)
+        except WorkLimitError:
+            raise
+        except NoWitnessError as error:
+            if not attempt:
+                raise
+            raise NoWitnessError(
+                f"the bounds from x(0) need a larger region than there is: {error}"
+            ) from None
+        if (reached < widths[restricted]).all():
+            if (reached > _TIGHT * widths[restricted]).any():
+                return widths
+            widths = _with(plant, restricted, _WIDER * reached)  # inside it the bounds are not larger
+            continue
+        grown = _WIDER * _extrapolated(last, reached, widths[restricted])
+        widths = _with(plant, restricted, np.maximum(grown, _LEAST * grown.max()))
+    raise NoWitnessError(f"{_described(plant, widths)}: the bounds are not within it, as on the smaller ones")
 
 
 def _witness(
@@ -145,7 +164,7 @@ def _restricted(plant: PlantOnRegions) -> list[int]:
     widths, found = plant.typical.copy(), []
     while True:  # the equations may not be defined on all of the typical region
         try:
-            best = _halves(plant, widths)
+            best = _entries(plant, widths)
             break
         except NotEnclosedError as error:
             if widths.max() < _FIRST * plant.typical.max():
@@ -155,7 +174,7 @@ def _restricted(plant: PlantOnRegions) -> list[int]:
         wider = widths.copy()
         wider[k] = np.inf
         try:
-            is_same = np.allclose(_halves(plant, wider), best, rtol=_SAME, atol=0)
+            is_same = np.abs(_entries(plant, wider) - best).max() <= _SAME * np.abs(best).max()
         except NotEnclosedError:
             is_same = False
         if is_same:
@@ -165,11 +184,12 @@ def _restricted(plant: PlantOnRegions) -> list[int]:
     return found
 
 
-def _halves(plant: PlantOnRegions, widths: Vector) -> Vector:
-    """Return half-widths and sizes of disturbances of the plants that enclose the equations."""
+def _entries(plant: PlantOnRegions, widths: Vector) -> Vector:
+    """Return matrices, half-widths and sizes of disturbances of the plants that enclose the equations."""
     plants = plant.on(widths)[0].plants
     sizes = np.sqrt((floats(plants.pushes) ** 2).sum(axis=1))
-    return np.concatenate([floats(plants.half_A).ravel(), floats(plants.half_B).ravel(), sizes])
+    matrices = plants.A, plants.B, plants.half_A, plants.half_B
+    return np.concatenate([*(floats(M).ravel() for M in matrices), sizes])
 
 
 def _with(plant: PlantOnRegions, restricted: Sequence[int], sizes: Vector) -> Vector:
