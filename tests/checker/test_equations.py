@@ -2,6 +2,8 @@
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from noack_check.__main__ import check_file
 from noack_check.check import RejectedError
 from noack_check.equations import LinearPlants, enclose
 from noack_check.loop import Region
-from tests.oracles.attacked_regions import SCENARIOS
+from tests.oracles.attacked_regions import CASES, SCENARIOS, attacked, certificate_of
 
 Field = Callable[[Any, Any], Any]
 FIELDS: dict[str, Field] = {
@@ -67,6 +69,7 @@ def unexplained(plants: LinearPlants, field: Field, z: Matrix) -> Vector:
         columns = np.vstack([np.hstack([s * D, -np.ones((n, 1))]) for s in (1, -1)])
         sides = np.concatenate([left + room, room - left])
         answer = linprog([0.0] * k + [1.0], columns, sides, bounds=[*limits, (None, None)])
+        assert answer.x is not None
         missed.append(answer.x[-1])
     return np.array(missed)
 
@@ -174,9 +177,53 @@ def test_a_stronger_nonlinearity_is_another_plant(witness: dict[str, Any]) -> No
 
 
 def test_a_bound_of_a_region_has_to_be_there_from_the_start_on(witness: dict[str, Any]) -> None:
-    for keep in (lambda entry: entry["output"] != "x[0]", lambda entry: entry["output"] == "drift"):
-        changed = copy.deepcopy(witness)
-        bounds = changed["statements"][0]["bounds"]
-        changed["statements"][0]["bounds"] = [entry for entry in bounds if keep(entry)]
-        with pytest.raises(RejectedError, match=r"region: x\[0\] has no bound"):
-            list(check_file(changed, None))
+    changed = copy.deepcopy(witness)
+    bounds = changed["statements"][0]["bounds"]
+    changed["statements"][0]["bounds"] = [entry for entry in bounds if entry["output"] != "x[0]"]
+    with pytest.raises(RejectedError, match=r"region: x\[0\] has no bound"):
+        list(check_file(changed, None))
+
+
+SATURATED = """import numpy as np
+class Saturated:
+    def derivative(self, t_s, z, u):
+        return z[1], 9.81 * np.sin(z[0]) - 0.1 * z[1] + np.clip(u[0], -{limit}, {limit})
+"""
+
+
+@pytest.mark.parametrize(("limit", "is_proven"), [(9.0, True), (5.0, False)])
+def test_a_saturated_input_is_proven_to_stay_inside_its_limits(
+    tmp_path: Path, limit: float, is_proven: bool
+) -> None:
+    (tmp_path / "own.py").write_text(SATURATED.format(limit=limit))
+    system = f'plant.system={{kind="python", file="{tmp_path}/own.py", name="Saturated"}}'
+    resolved = resolve(load(SCENARIOS / "sine_pendulum.toml", [system]))
+    content = resolved_content(resolved, resolved.certificate.late_periods)
+    statement = find_region_statement(resolved, content, "ideal")
+    if not is_proven:  # the first input is 7.5 N m
+        assert "|angle| ≤" in statement.reason
+        assert "|torque| ≤" in statement.reason
+        return
+    assert statement.document is not None, statement.reason
+    assert statement.document["region"]["u"][0] < limit  # type: ignore[index]
+    bounds = statement.document["bounds"]
+    assert isinstance(bounds, list)
+    less = {**statement.document, "bounds": [entry for entry in bounds if entry["output"] != "u[0]"]}
+    with pytest.raises(RejectedError, match=r"region: u\[0\] has no bound"):
+        list(check_file({"scenario": content, "statements": [less]}, None))
+
+
+def test_no_attack_exceeds_what_is_proven_on_a_region() -> None:
+    case = CASES["pendulum"]._replace(semi_axes=(0.5, 1e-9))  # from the scenario's x(0)
+    resolved = resolve(load(SCENARIOS / "sine_pendulum.toml", ["network.mansd=2"]))
+    content = resolved_content(resolved, resolved.certificate.late_periods)
+    proven = find_region_statement(resolved, content, "schedule").bounds
+    assert proven is not None
+    computed = certificate_of(resolved, case.semi_axes)
+    assert computed.region is not None
+    angle = sum(proven.bounds["x[0]"])
+    region = computed.region._replace(x=(angle, *computed.region.x[1:]))
+    certificate = replace(computed.with_proof(proven), region=region)
+    worst = attacked(resolved, case, certificate, runs=100, steps=600)
+    assert all(0.1 < share < 1 for share in worst.values()), worst
+    assert proven.bounds["x"].decaying < 0.5 * (computed.first("state") or 0.0)
