@@ -148,7 +148,7 @@ def key_numbers(summary: RunSummary) -> Numbers:
         ("deliveries", str(loop.deliveries)),
         *_losses(summary, loop),
         *interval_rows(loop.inter_event_min_s, loop.inter_event_median_s, loop.inter_delivery_median_s),
-        *((f"|{output.name}| at most, at the end", _output_values(output)) for output in loop.outputs),
+        *((f"|{_deviation(output)}| at most, at the end", _output_values(output)) for output in loop.outputs),
         (f"{state_norm(loop)} at the start", number(loop.initial_state_norm)),
         (f"{state_norm(loop)} at the end", number(loop.final_state_norm)),
         ("maximum ‖e_s‖, ‖e_c‖", f"{number(loop.sup_e_s_norm)}, {number(loop.sup_e_c_norm)}"),
@@ -160,6 +160,11 @@ def key_numbers(summary: RunSummary) -> Numbers:
         *_replay(loop.replay),
         *_ideal_loop(loop.ideal_loop),
     )
+
+
+def _deviation(output: OutputPart) -> str:
+    """Return the name of the distance of an output from what it follows."""
+    return f"{output.name} − r" if output.target == "reference" else output.name
 
 
 def _output_values(output: OutputPart) -> str:

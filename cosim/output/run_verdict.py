@@ -98,11 +98,10 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
             continue
         allowed = f"{output.allowed:g} {output.unit}".rstrip()
         if output.settled_s is None:
-            texts.append(f"{output.name} was not within {allowed} of its set-point at the end")
+            texts.append(f"{output.name} was not within {allowed} of its {output.target} at the end")
         else:
-            texts.append(
-                f"{output.name} was within {allowed} of its set-point from {output.settled_s:.3g} s on"
-            )
+            since = f"from {output.settled_s:.3g} s on"
+            texts.append(f"{output.name} was within {allowed} of its {output.target} {since}")
         promised = guaranteed.get(output.name, "").rpartition(" from ")[2]
         texts[-1] += f" (guaranteed from {promised})" if promised else " (not guaranteed)"
         is_good = is_good and output.settled_s is not None

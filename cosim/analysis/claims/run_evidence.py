@@ -47,7 +47,12 @@ from noack.theory.certificates.certified_bounds import (
     ScenarioCertificate,
     known_state_bounds,
 )
-from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
+from noack.theory.certificates.conditions import (
+    about_reference,
+    allowed_conditions,
+    ideal_conditions,
+    nominal_conditions,
+)
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.coverage import refusals
 from noack.theory.paper import Theorem2, theorem_2
@@ -197,12 +202,10 @@ class RunEvidence:
             return None
         if not any(certificate.exists for certificate in self._scheduled):
             return None
-        stated, most_work = whole_record.scenario, self.most_work
-        if stated.controller.reference is not None and widest.hold_s > self.allowed.hold_s:
-            return None  # u_r of an older input would differ by more than the certificates allow for
-        certificates = certificates_under(
-            widest, self.record.scenario, self.start_error, stated, most_work=most_work
-        )
+        stated, moved, most_work = whole_record.scenario, self.record.scenario, self.most_work
+        if stated.controller.reference is not None:  # u_r of an older input differs by more
+            moved = about_reference(stated, hold_s=widest.hold_s).model_copy(update={"changes": ()})
+        certificates = certificates_under(widest, moved, self.start_error, stated, most_work=most_work)
         return certificates if any(certificate.exists for certificate in certificates) else None
 
     @cached_property

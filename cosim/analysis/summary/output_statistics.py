@@ -9,11 +9,11 @@ from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.outputs import LoopOutput
-from noack.scenario.resolution import setpoint_of
+from noack.scenario.resolution import loop_of
 
 
 def output_parts(record: RunRecord) -> list[OutputPart]:
-    """Return the distances of the stated outputs from their set-points, over the steps of the plant."""
+    """Return the distances of the stated outputs from what they follow, over the steps of the plant."""
     if record.scenario.outputs is None:
         return []
     return [_output_part(record, output) for output in record.scenario.loop_outputs()]
@@ -33,6 +33,7 @@ def _output_part(record: RunRecord, output: LoopOutput) -> OutputPart:
         name=output.name,
         unit=output.unit,
         allowed=output.allowed,
+        target="set-point" if record.scenario.controller.reference is None else "reference",
         largest=largest,
         last=last,
         settled_s=settled_s,
@@ -43,8 +44,8 @@ def _distances(
     record: RunRecord, output: LoopOutput
 ) -> Iterator[tuple["np.ndarray[tuple[int], np.dtype[np.float64]]", ...]]:
     """Yield times in s and |y − r|, (k,) each."""
-    row, setpoint = np.array(output.row), setpoint_of(record.scenario)
-    rest = 0.0 if setpoint is None else float(row @ setpoint[0])
+    row, reference = np.array(output.row), loop_of(record.scenario).reference
     for steps in record.batches(PLANT_STEP, ("t_ns", "x")):
         if len(steps):
-            yield steps["t_ns"] / NS_PER_S, np.abs(steps["x"] @ row - rest)
+            x = steps["x"] if reference is None else steps["x"] - reference.states(steps["t_ns"])
+            yield steps["t_ns"] / NS_PER_S, np.abs(x @ row)

@@ -333,12 +333,14 @@ class ExitPart(SummaryPart):
 
 
 class OutputPart(SummaryPart):
-    """An output that the scenario states: its distance from its set-point during the run."""
+    """An output that the scenario states: its distance from its set-point or reference during the run."""
 
     name: Text
     unit: str
     allowed: Real
     """The allowed error; None: nothing is asked."""
+    target: str
+    """What it is to follow: set-point or reference."""
     largest: Real
     last: Real
     settled_s: Real

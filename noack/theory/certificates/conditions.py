@@ -201,16 +201,19 @@ def kept_probability(
     return max(kept - excluded_probability(resolved), 0.0)
 
 
-def about_reference(resolved: Scenario, late_periods: int = 0) -> Scenario:
+def about_reference(resolved: Scenario, late_periods: int = 0, *, hold_s: float | None = None) -> Scenario:
     """Return the loop in the coordinates around its reference or set-point, which is 0 there.
 
-    ``late_periods``: the permitted lateness, on which the age of u_r in a held input depends.
+    ``hold_s``: the largest age of u_r in a held input; by default that with a lateness of
+    ``late_periods`` steps.
     """
     loop = loop_of(resolved)
     if loop.reference is None:
         return resolved
     plant = resolved.plant
-    pushes = reference_pushes(resolved, nominal_conditions(resolved, late_periods).hold_s)
+    if hold_s is None:
+        hold_s = nominal_conditions(resolved, late_periods).hold_s
+    pushes = reference_pushes(resolved, hold_s)
     update = {
         "initial_state": tuple((loop.x0 - loop.reference.state(0)).tolist()),
         "disturbances": (*plant.disturbances, *pushes),
