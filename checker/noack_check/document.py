@@ -37,23 +37,24 @@ def read_number(table: Mapping[str, object], key: str) -> arb:
     return found
 
 
-def read_matrix(
-    table: Mapping[str, object],
-    key: str,
-    size: int | None = None,
-    *,
-    most: int | None = None,
-    symmetric: bool = True,
-) -> arb_mat:
-    """Return a square matrix, perhaps of a given size, or of at most some size."""
+def read_rows(table: Mapping[str, object], key: str) -> arb_mat:
+    """Return a matrix of any size."""
     rows = table.get(key)
     if not isinstance(rows, list) or not rows or not all(isinstance(row, Sequence) for row in rows):
         raise RejectedError(f"{key}: not a matrix")
-    n = len(rows)
-    wrong = (size is not None and n != size) or (most is not None and n > most)
-    if wrong or any(len(row) != n for row in rows):
+    if any(len(row) != len(rows[0]) for row in rows):
+        raise RejectedError(f"{key}: rows of different lengths")
+    return arb_mat([[read_number({key: value}, key) for value in row] for row in rows])
+
+
+def read_matrix(
+    table: Mapping[str, object], key: str, size: int | None = None, *, most: int | None = None
+) -> arb_mat:
+    """Return a symmetric matrix, perhaps of a given size, or of at most some size."""
+    found = read_rows(table, key)
+    n = found.nrows()
+    if found.ncols() != n or (size is not None and n != size) or (most is not None and n > most):
         raise RejectedError(f"{key}: not a square matrix of the right size")
-    found = arb_mat([[read_number({key: value}, key) for value in row] for row in rows])
-    if symmetric and any(found[i, j] != found[j, i] for i in range(n) for j in range(i)):
+    if any(found[i, j] != found[j, i] for i in range(n) for j in range(i)):
         raise RejectedError(f"{key}: not symmetric")
     return found

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import frobenius, identity, is_zero, stack, zeros
+from noack_check.balls import frobenius, identity, is_zero, rows_of, stack, zeros
 
 _MOST_STATES, _MOST_LOSSES = 40, 1000
 """A proof of a larger loop would take hours."""
@@ -55,17 +55,25 @@ class Observer(NamedTuple):
     """
 
     correction: arb_mat  # I − LC, (n, n)
+    first_correction: arb_mat  # the same at the first test
     start: arb_mat  # x̂ − x before the first test, at t = 0, (n, 1)
     period: fmpq  # T, s, exactly between two tests
 
 
+class Smooth(NamedTuple):
+    """A part Ss of n that decays smoothly, ṡ = Λs; with no entries there is none."""
+
+    columns: arb_mat  # S, (n, q)
+    rates: arb_mat  # Λ, (q, q)
+    start: arb_mat  # s(0), (q, 1)
+
+
 class Noise(NamedTuple):
-    """Bounds of n, where x + n is what the sensor takes for the state at a test: n = s + Σ column p."""
+    """Bounds of n, where x + n is what the sensor takes for the state at a test: n = Ss + Σ column p."""
 
     columns: arb_mat  # (n, k)
     decaying: int  # of so many columns, the first ones, |p| ≤ f₁; of the others |p| ≤ f₂
-    smooth: arb_mat  # Λ in ṡ = Λs, (n, n); (0, 0): s = 0
-    start: arb_mat  # s(0), (n, 1)
+    smooth: "Smooth"
     sizes: tuple[arb, arb]
     """‖W n‖ is at most their sum, times f₁ and f₂."""
 
@@ -110,6 +118,10 @@ class Loop(NamedTuple):
     """What is known of each disturbance; (): nothing of any."""
     region: Region | None = None
     """Where the plant is one with such matrices and disturbances; None: everywhere."""
+    loads: int = 0
+    """The last states are so many constants, which are 0 in these coordinates: see :mod:`.scenario`."""
+    push_before_input: arb_mat | None = None
+    """What is added to ẋ while no input acts, (n, 1); None: 0."""
 
     @property
     def output_rows(self) -> arb_mat:
@@ -126,7 +138,7 @@ class Loop(NamedTuple):
         """Bounds of n without an observer."""
         n, rows = self.n, (self.weight * self.noise).tolist() if self.noise.ncols() else []
         size = frobenius(arb_mat(1, len(rows), [sum((abs(entry) for entry in row), arb(0)) for row in rows]))
-        return Noise(self.noise, 0, zeros(0, 0), zeros(n, 1), (arb(0), size))
+        return Noise(self.noise, 0, Smooth(zeros(n, 0), zeros(0, 0), zeros(0, 1)), (arb(0), size))
 
     @property
     def needs_constant(self) -> bool:
@@ -160,8 +172,11 @@ class Loop(NamedTuple):
             "rule.positive": rule.positive, "rule.negative": rule.negative,
         }  # fmt: skip
         if self.observer is not None:
-            shapes |= {"correction": (n, n), "first estimate": (n, 1)}
+            shapes |= {"correction": (n, n), "first correction": (n, n), "first estimate": (n, 1)}
             matrices |= {"correction": self.observer.correction, "first estimate": self.observer.start}
+            matrices |= {"first correction": self.observer.first_correction}
+        if self.push_before_input is not None:
+            shapes["push"], matrices["push"] = (n, 1), self.push_before_input
         shapes |= {name: (matrices[name].nrows(), 2 * n) for name in ("rule.positive", "rule.negative")}
         for name, M in matrices.items():
             if (M.nrows(), M.ncols()) != shapes[name]:
@@ -175,6 +190,14 @@ class Loop(NamedTuple):
         for name, size in sizes.items():
             if not (size.is_finite() and size >= 0):
                 return f"{name}: not a number of at least 0"
+        if not 0 <= self.loads < n:
+            return "loads: not fewer than states"
+        constant = range(n - self.loads, n)
+        moving = (self.A, self.B, self.half_A, self.half_B, self.start, self.pushes)
+        if self.push_before_input is not None:
+            moving = (*moving, self.push_before_input)
+        if not all(is_zero(rows_of(M, constant)) for M in moving):
+            return "loads: they may change, or are not 0 in these coordinates"
         if self.observer is not None:
             is_known = is_zero(self.half_A) and is_zero(self.half_B)
             if not (is_known and self.model_A == self.A and self.model_B == self.B):

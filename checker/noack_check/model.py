@@ -6,10 +6,10 @@ of constant bounds. With the input u = K e^{−Hs} x_c of age s,
 
     ẋ = Ax + Bu + Dd,   ė = H(x + e) − ẋ,   ẇ = Hw,   ḟ₁ = −r f₁,   ḟ₂ = 0.
 
-At a test the sensor takes x + n for x, with n = s + Σ column p: see :mod:`.noise`. Here s is a state, and
+At a test the sensor takes x + n for x, with n = Ss + Σ column p: see :mod:`.noise`. Here s is a state, and
 the p with |p| ≤ f₁ or f₂ are others at each test. An event sets x_s := x + n, so e := n at once, since the
 sensor's model is reset whether or not the update arrives, and w grows by e − n. The rule compares x + n and
-e − n. The entries of z for e are those of e − s. Those for p are used at tests only; with tests at all times
+e − n. The entries of z for e are those of e − Ss. Those for p are used at tests only; with tests at all times
 also in flows, where some p at each time makes the rule silent.
 
 A location says what becomes of the updates that were sent since the one that the acting input
@@ -217,16 +217,18 @@ class Model:
         if noise is None and loop.observer is not None:
             raise ValueError("noise: that of the observer is missing")
         self.bounds = noise = noise or loop.plain_noise
-        smooth = range((3 + copies) * n, (3 + copies) * n + noise.smooth.nrows())
+        smooth = range((3 + copies) * n, (3 + copies) * n + noise.smooth.rates.nrows())
         self._sources = range(smooth.stop, smooth.stop + noise.columns.ncols())
         self.size = self._sources.stop + 2
         every = identity(self.size)
         vectors = [rows_of(every, range(i, i + n)) for i in range(0, smooth.start, n)]
         self.x, self._error, self.w, *self.v = vectors
+        self._moving = rows_of(self.x, range(n - loop.loads))
         self.s, self.p = rows_of(every, smooth), rows_of(every, self._sources)
-        self.e = self._error + self.s if smooth else self._error
+        self._decaying = noise.smooth.columns * self.s if smooth else 0 * self.x
+        self.e = self._error + self._decaying if smooth else self._error
         self.f1, self.f2 = (rows_of(every, [self.size - 2 + i]) for i in range(2))
-        self.noise = self.s if smooth else 0 * self.x
+        self.noise = 1 * self._decaying
         if self._sources:
             self.noise += noise.columns * self.p
         units = [self.f1] * noise.decaying + [self.f2] * len(self._sources)
@@ -294,7 +296,7 @@ class Model:
             name, coordinates = f"{later} later", self._coordinates(True, later)
             found.append(Location(name, coordinates, nodes, flows, facts, (), False))
         if times.start > 0:
-            no_input = self._flows([0 * self.loop.gain])
+            no_input = self._flows([0 * self.loop.gain], self._before_input())
             for later in range(self.later_at_start + 1):
                 name, coordinates = f"start, {later} later", self._coordinates(False, later)
                 nodes = self._time_to(times.start, later)
@@ -347,7 +349,8 @@ class Model:
         n, first = self.loop.n, self.size - 2
         units = ([first] if self._has_f1 else []) + ([first + 1] if self.loop.needs_constant else [])
         w, s = range(2 * n, 3 * n) if has_w else range(0), self._sources.start - self.s.nrows()
-        return (*range(2 * n), *w, *range(3 * n, (3 + copies) * n), *range(s, self._sources.start), *units)
+        x_and_e = (*range(n - self.loop.loads), *range(n, 2 * n))
+        return (*x_and_e, *w, *range(3 * n, (3 + copies) * n), *range(s, self._sources.start), *units)
 
     def _units(self) -> set[str]:
         """Return the names of c of all units."""
@@ -387,7 +390,15 @@ class Model:
                 break
         return [point + rests for points, rests in found for point in points]
 
-    def _flows(self, gains: list[arb_mat]) -> tuple[Flow, ...]:
+    def _before_input(self) -> tuple[Unknown, ...]:
+        """Return what pushes x until an input acts: e^{r·start} f₁ or f₂ times it is at least it."""
+        loop = self.loop
+        if loop.push_before_input is None or is_zero(loop.push_before_input):
+            return ()
+        unit = self.f2 if loop.needs_constant else (self.rate * loop.times.start).exp() * self.f1
+        return (Unknown(self._push(loop.push_before_input), unit),)
+
+    def _flows(self, gains: list[arb_mat], further: tuple[Unknown, ...] = ()) -> tuple[Flow, ...]:
         loop, H = self.loop, self.loop.H
         found = []
         for gain in gains:
@@ -396,11 +407,11 @@ class Model:
             error, smooth = H * (self.x + self.e) - velocity, self.s
             copies = (H * v for v in self.v)
             if self.s.nrows():
-                smooth = self.bounds.smooth * self.s
-                error -= smooth
+                smooth = self.bounds.smooth.rates * self.s
+                error -= self.bounds.smooth.columns * smooth
             units = 0 * self.p, -self.rate * self.f1, 0 * self.f2
             matrix = stack([velocity, error, H * self.w, *copies, smooth, *units])
-            found.append(Flow(matrix, tuple(self._unknowns(u)), u))
+            found.append(Flow(matrix, (*self._unknowns(u), *further), u))
         return tuple(found)
 
     def _unknowns(self, u: arb_mat) -> Iterator[Unknown]:
@@ -491,7 +502,7 @@ class Model:
     def jump(self, e: arb_mat, w: arb_mat, v: Sequence[arb_mat]) -> arb_mat:
         """Return z after a jump; other vectors than these become 0."""
         rest = [0 * self.w] * (len(self.v) - len(v))
-        error = e - self.s if self.s.nrows() else e
+        error = e - self._decaying if self.s.nrows() else e
         return stack([self.x, error, w, *v, *rest, self.s, self.p, self.f1, self.f2])
 
     @property
@@ -507,7 +518,7 @@ class Model:
 
         P is that of xᵀXx + (e, w)ᵀQ(e, w) − c₁ f₁² − c₂ f₂² − a θ·(comparison), with X common to all
         locations: then x drops out of the edges, and a silent test at θ leaves V as it is where the
-        comparison is ≤ 0, since a ≥ 0. With s it is (x, s)ᵀX(x, s), and e − s for e. With noise each of the
+        comparison is ≤ 0, since a ≥ 0. With s it is (x, s)ᵀX(x, s), and e − Ss for e. With noise each of the
         comparison's four terms has an a of its own, and there is an inequality for silent tests.
         Waiting locations have Q, c₁ and c₂ for each node. Where an event's guard contains x, each location
         has a form of x, e and w of its own, and with a periodic rule each node of each location.
@@ -524,9 +535,12 @@ class Model:
         own = f"{place.name}, {node}" if by_node else place.name
         starts = place.name.startswith("start")
         X = f"X/start, {node}" if starts else "X"
-        parts: tuple[tuple[str, arb_mat], ...] = ((X, stack([self.x, self.s]) * E), (f"Q/{own}", errors * E))
+        parts: tuple[tuple[str, arb_mat], ...] = (
+            (X, stack([self._moving, self.s]) * E),
+            (f"Q/{own}", errors * E),
+        )
         if rule.negative.nrows() or self.is_periodic:
-            parts = ((f"P/{own}", stack([self.x, self.s, errors]) * E),)
+            parts = ((f"P/{own}", stack([self._moving, self.s, errors]) * E),)
         units = [(name, f) for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)]
         scalars = []
         for name, f in units:
@@ -683,7 +697,7 @@ class Model:
         index = self.loop.losses + 1 + self._waiting if self.loop.times.start > 0 else 0
         z = transpose(self.x) * self.loop.start + transpose(self.f1) + transpose(self.f2)
         if self.s.nrows():
-            z += transpose(self.s) * self.bounds.start
+            z += transpose(self.s) * self.bounds.smooth.start
         if self._sources:
             z = beside(z, transpose(self._error) * self.bounds.columns + transpose(self.p))
         at_start = rows_of(z, self.locations[index].coordinates)

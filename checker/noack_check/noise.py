@@ -1,21 +1,21 @@
-"""What the sensor takes for the state at a test: x + n, with n = s + Σ column p, |p| ≤ f₁ = e^{−rt} or ≤ 1.
+"""What the sensor takes for the state at a test: x + n, with n = Ss + Σ column p, |p| ≤ f₁ = e^{−rt} or ≤ 1.
 
 Without an observer n is the noise of a measurement. The error of an observer's estimate does not depend on
 the rest of the loop, if the plant has the matrices that the observer uses:
 
-    n_{k+1} = (I − LC) (e^{AT} n_k − ∫₀ᵀ e^{As} D d ds) + L v_{k+1},   n_0 = (I − LC) (x̂ − x)(0) + L v_0.
+    n_{k+1} = (I − LC) (e^{AT} n_k − ∫₀ᵀ e^{As} D d ds) + L v_{k+1},   n_0 = (I − L₀C) (x̂ − x)(0) + L₀ v_0.
 
-What follows from the start is F^k (I − LC) (x̂ − x)(0), F = (I − LC) e^{AT}. A state s with ṡ = Λs is near it
-at the tests, if a witness names a suitable Λ; the difference decays as f₁. What follows from noise v and
-disturbances d has a constant bound, the sum of all |F^j S|. Both are found from powers up to one that is
-small, in coordinates of W n.
+L₀ is L, or v = 0. What follows from the start is F^k (I − L₀C) (x̂ − x)(0), F = (I − LC) e^{AT}. Ss with
+ṡ = Λs is near it at the tests, if a witness names suitable S, Λ and s(0); the difference decays as f₁. What
+follows from noise v and disturbances d has a constant bound, the sum of all |F^j S|. Both are found from
+powers up to one that is small, in coordinates of W n.
 """
 
 from flint import arb, arb_mat
 
-from noack_check.balls import columns_of, frobenius, identity, upto, zeros
+from noack_check.balls import columns_of, frobenius, identity, upto
 from noack_check.check import RejectedError
-from noack_check.loop import Loop, Noise, Observer
+from noack_check.loop import Loop, Noise, Observer, Smooth
 
 _MOST_POWERS, _SMALL = 20_000, 1e-6
 _CELLS = 4
@@ -24,8 +24,8 @@ _LITTLE = 0.01
 """A decaying bound below such a share of the constant one is added to it."""
 
 
-def noise_of(loop: Loop, rate: arb, smooth: arb_mat | None = None) -> Noise:
-    """Return bounds of n; ``smooth`` is Λ, without which s = 0.
+def noise_of(loop: Loop, rate: arb, smooth: Smooth | None = None) -> Noise:
+    """Return bounds of n; without ``smooth`` s = 0.
 
     Raises:
         RejectedError: the error of the observer is not proven to decay as fast as f₁.
@@ -48,12 +48,12 @@ def noise_of(loop: Loop, rate: arb, smooth: arb_mat | None = None) -> Noise:
     chosen = [[(i, size) for i, size in enumerate(bounds) if size > 0] for bounds in (rest, constant)]
     columns = [size * columns_of(inverse, [i]) for bounds in chosen for i, size in bounds]
     entries = [column[i, 0] for i in range(loop.n) for column in columns]
-    s = (zeros(0, 0), zeros(loop.n, 1)) if smooth is None else (smooth, _first_error(loop.observer))
-    return Noise(arb_mat(loop.n, len(columns), entries), len(chosen[0]), *s, sizes)
+    smooth = smooth or loop.plain_noise.smooth
+    return Noise(arb_mat(loop.n, len(columns), entries), len(chosen[0]), smooth, sizes)
 
 
 def _first_error(observer: Observer) -> arb_mat:
-    return observer.correction * observer.start
+    return observer.first_correction * observer.start
 
 
 def _step(loop: Loop, observer: Observer, M: arb_mat) -> arb_mat:
@@ -61,19 +61,25 @@ def _step(loop: Loop, observer: Observer, M: arb_mat) -> arb_mat:
     return loop.weight * M * (arb(observer.period) * loop.A).exp() * loop.weight.inv()
 
 
-def _from_start(loop: Loop, observer: Observer, rate: arb, smooth: arb_mat | None) -> tuple[list[arb], arb]:
-    """Return bounds of e^{rt} |W (n − s)| by entries, and of e^{rt} ‖W n‖, of what follows from the start."""
-    T, first = arb(observer.period), loop.weight * _first_error(observer)
-    steps, vectors = [_step(loop, observer, observer.correction)], [first]
+def _from_start(loop: Loop, observer: Observer, rate: arb, smooth: Smooth | None) -> tuple[list[arb], arb]:
+    """Return bounds of e^{rt} |W (n − Ss)| by entries and of e^{rt} ‖W n‖, of what follows from the start."""
+    T = arb(observer.period)
+    steps, vectors = [_step(loop, observer, observer.correction)], [loop.weight * _first_error(observer)]
+    images = [identity(loop.n)]
     if smooth is not None:
-        steps.append(loop.weight * (T * smooth).exp() * loop.weight.inv())
-        vectors.append(-1 * first)
+        steps.append((T * smooth.rates).exp())
+        vectors.append(smooth.start)
+        images.append(-1 * loop.weight * smooth.columns)
     steps = [(rate * T).exp() * step for step in steps]
     rest, sizes = [arb(0)] * loop.n, [arb(0)] * len(steps)
     for _ in range(max(_length(step) for step in steps)):
-        difference = sum(vectors[1:], vectors[0]).entries()
+        parts = [image * vector for image, vector in zip(images, vectors, strict=True)]
+        difference = sum(parts[1:], parts[0]).entries()
         rest = [most.max(arb(entry.abs_upper())) for most, entry in zip(rest, difference, strict=True)]
-        sizes = [most.max(frobenius(vector)) for most, vector in zip(sizes, vectors, strict=True)]
+        sizes = [
+            most.max(frobenius(image) * frobenius(vector) if number else frobenius(vector))
+            for number, (most, image, vector) in enumerate(zip(sizes, images, vectors, strict=True))
+        ]
         vectors = [step * vector for step, vector in zip(steps, vectors, strict=True)]
     beyond = _SMALL * sum(sizes, arb(0))
     return [most.max(beyond) for most in rest], sizes[0]

@@ -26,8 +26,8 @@ from flint import arb, arb_mat, fmpq
 
 from noack_check.balls import around_zero, frobenius, identity, is_zero, upto
 from noack_check.check import RejectedError, verify
-from noack_check.document import read_count, read_matrix, read_number, read_table
-from noack_check.loop import Loop, Noise, Region, Times
+from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
+from noack_check.loop import Loop, Noise, Region, Smooth, Times
 from noack_check.model import Chain, Errors, Model, thresholds
 from noack_check.noise import noise_of
 from noack_check.norms import decays_below, growth
@@ -143,9 +143,7 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     pieces = read_count(document, "pieces", MOST_PIECES) if "pieces" in document else 1
     if pieces < 1:
         raise RejectedError("pieces: below 1")
-    smooth = None
-    if "observer" in document:
-        smooth = read_matrix(read_table(document, "observer"), "smooth", loop.n, symmetric=False)
+    smooth = _read_smooth(loop, document) if "observer" in document else None
     noise = noise_of(loop, rate, smooth)
     if "errors" not in document:
         return Assumptions(None, later, at_start, chain, pieces, noise)
@@ -161,6 +159,17 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     if not all(size == 0 or (size > 0 and is_unit) for size, is_unit in zip(sizes, units, strict=True)):
         raise RejectedError("errors: below 0, or in a unit that the loop does not have")
     return Assumptions(Errors(*sizes, chain), later, at_start, chain, pieces, noise)
+
+
+def _read_smooth(loop: Loop, document: Mapping[str, object]) -> Smooth:
+    """Return the part of the observer's error that decays smoothly; nothing of it has to be right."""
+    table = read_table(document, "observer")
+    columns, rates, start = (read_rows(table, key) for key in ("columns", "rates", "start"))
+    q = rates.nrows()
+    shapes = [(M.nrows(), M.ncols()) for M in (columns, rates, start)]
+    if shapes != [(loop.n, q), (q, q), (q, 1)]:
+        raise RejectedError("observer: columns, rates and start do not fit")
+    return Smooth(columns, rates, start)
 
 
 def require_few_at_start(loop: Loop, assumed: Assumptions) -> bool:
@@ -227,6 +236,8 @@ def error_without_input(loop: Loop, until: fmpq) -> arb:
     pushes = arb_mat(loop.n, 1)
     if loop.sizes:
         pushes = loop.pushes * arb_mat(len(loop.sizes), 1, [around_zero(size) for size in loop.sizes])
+    if loop.push_before_input is not None:
+        pushes += loop.push_before_input
     largest, _ = growth(weighted(loop, arb(0)), arb(until))
     step, x, reached = arb(until) / _CELLS, loop.start, largest * _most_noise(loop)
     within, forward = (upto(step) * A).exp(), (step * A).exp()

@@ -8,7 +8,7 @@ an input, and what is left of the plant is a constant disturbance A x_r.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
-from typing import NamedTuple
+from typing import NamedTuple, Required, TypedDict
 
 from flint import arb, arb_mat, fmpq
 
@@ -78,7 +78,6 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool, enclosed: Enclosed | N
         gain=matrix(_matrix(model, "model.gain")),
         weight=weight,
         holds=_choice(resolved, "mode", ("model", "zoh")) == "zoh",
-        start=matrix([[value] for value in _row(plant, "plant.initial_state")]) - matrix([[v] for v in x_r]),
         rule=rule,
         pushes=arb_mat(n, len(pushes), [column[i] for i in range(n) for column in pushes]),
         sizes=(arb(1),) * len(pushes),
@@ -87,7 +86,10 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool, enclosed: Enclosed | N
         outputs=_outputs(resolved, n),
         losses=_losses(_table(resolved, "network")),
         times=_times(resolved, trigger, ideal=ideal),
+        **_start(resolved, plants, x_r),
     )
+    if enclosed is not None and loop.loads:
+        raise RefusedError("model.load_states: not covered on a region")
     return loop if enclosed is None else _with_equations(loop, resolved, enclosed)
 
 
@@ -142,6 +144,48 @@ def _input_room(plant: Table, m: int) -> list[arb]:
             values = _row(entry, f"plant.disturbances.{name}")
             room = [each + abs(number(value)) for each, value in zip(room, values, strict=True)]
     return room
+
+
+class _Start(TypedDict, total=False):
+    """Where a loop starts."""
+
+    start: Required[arb_mat]
+    loads: int
+    push_before_input: arb_mat
+
+
+def _start(resolved: Table, plants: _Plants, x_r: Sequence[float]) -> _Start:
+    """Return where the loop starts, in coordinates in which its set-point and its loads are 0.
+
+    With u = Kx + K_d d and a constant d the closed loop rests at Πd, where (A + BK)Π + E + BK_d = 0. There
+    the plant, both models and the observer rest together, at (Πd, d). So the loop about this point is the
+    same loop with the load 0, but for the input: until the first one acts it is 0, and so −(KΠ + K_d)d from
+    its value at rest.
+    """
+    model, plant = _table(resolved, "model"), _table(resolved, "plant")
+    x_0 = matrix([[value] for value in _row(plant, "plant.initial_state")])
+    k = _whole(model, "model.load_states") if "load_states" in model else 0
+    if not k:
+        return {"start": x_0 - matrix([[value] for value in x_r])}
+    if any(x_r):
+        raise RefusedError("controller.setpoint: with model.load_states not covered")
+    n = len(plants.A) - k
+    if n < 1:
+        raise RefusedError("model.load_states: not fewer than states")
+    matrices = (plants.A, plants.B, plants.half_A, plants.half_B, model["A"], model["B"])
+    if any(any(row) for M in matrices for row in M[n:]):
+        raise RefusedError("model.load_states: the last states are not constant")
+    if any(any(column[n:]) for column in _disturbances(plant, plants)):
+        raise RefusedError("plant.disturbances: the load changes, and its statement is for a constant one")
+    if any(map(any, (*plants.half_A, *plants.half_B))):
+        raise RefusedError("model.load_states: the statement is for one plant, not for all in a box")
+    A, B, K = matrix(plants.A), matrix(plants.B), matrix(_matrix(model, "model.gain"))
+    closed, own = A + B * K, range(n)
+    load = rows_of(x_0, range(n, n + k))
+    effect = columns_of(rows_of(closed, own), range(n, n + k)) * load
+    rest = stack([-1 * columns_of(rows_of(closed, own), own).inv() * effect, load])
+    start = stack([rows_of(x_0 - rest, own), zeros(k, 1)])
+    return {"loads": k, "push_before_input": -1 * B * (K * rest), "start": start}
 
 
 def _box(plant: Table, A: Rows, B: Rows, own: _Plants) -> _Plants:
@@ -417,7 +461,7 @@ def _setpoint(resolved: Table, A: Rows, plants: _Plants) -> Sequence[float]:
     controller = _table(resolved, "controller")
     n = len(A)
     x_r = _row(controller, "controller.setpoint") if "setpoint" in controller else [0.0] * n
-    if len(x_r) != n:
+    if len(x_r) != n:  # with loads it has fewer
         raise RefusedError(f"controller.setpoint: not {n} numbers")
     if any(sum(Fraction(a) * Fraction(v) for a, v in zip(row, x_r, strict=True)) for row in A):
         raise RefusedError("controller.setpoint: it needs an input, which is 0 until the first one arrives")
@@ -481,7 +525,15 @@ def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | No
     if len(estimate) != n:
         raise RefusedError(f"observer.initial_estimate: not {n} numbers")
     start = matrix([[value] for value in estimate]) - matrix([[value] for value in x_0])
-    return Observer(identity(n) - L * C, start, fmpq(int(schedule.sample), NS_PER_S))
+    correction = first_correction = identity(n) - L * C
+    if "first_gain" in observer:
+        first = matrix(_matrix(observer, "observer.first_gain"))
+        if (first.nrows(), first.ncols()) != (n, C.nrows()):
+            raise RefusedError("observer.first_gain: not a row for each state, and a column for each output")
+        if _noise(resolved, n).ncols():
+            raise RefusedError("observer.first_gain: not covered with noise")
+        first_correction = identity(n) - first * C
+    return Observer(correction, first_correction, start, fmpq(int(schedule.sample), NS_PER_S))
 
 
 def _require_unknown_start(resolved: Table, name: str) -> None:

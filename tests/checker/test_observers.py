@@ -10,11 +10,12 @@ from flint import arb, fmpq
 from scipy.linalg import expm
 
 from noack.observers.observer_settings import observer_gain
+from noack.theory.witnesses.assumptions import smooth_part
 from noack.theory.witnesses.documents import Witness, find_witness
 from noack_check.balls import identity, matrix, number, zeros
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
-from noack_check.loop import Loop, Noise, Observer
+from noack_check.loop import Loop, Noise, Observer, Smooth
 from noack_check.model import Model
 from noack_check.noise import noise_of
 from noack_check.proof import prove
@@ -38,7 +39,7 @@ def observed(
     A, period_s = floats(loop.model_A), float(loop.times.sampling.p) / float(loop.times.sampling.q)
     L = observer_gain(expm(A * period_s), C, tuple(np.exp(np.array(poles) * period_s)))
     correction = matrix((np.eye(2) - L @ C).tolist())
-    observer = Observer(correction, matrix([[value] for value in start]), loop.times.sampling)
+    observer = Observer(correction, correction, matrix([[value] for value in start]), loop.times.sampling)
     noise_columns = matrix((L * noise).tolist()) if noise else zeros(2, 0)
     return loop._replace(B=loop.model_B, noise=noise_columns, observer=observer)
 
@@ -65,12 +66,13 @@ def simulated_errors(loop: Loop, rng: np.random.Generator, count: int) -> np.nda
     whole = expm(np.block([[A, np.eye(n)], [np.zeros((n, 2 * n))]]) * T)
     Ad, Gd = whole[:n, :n], whole[:n, n:]
     o, found, turn = floats(loop.observer.start)[:, 0], [], int(rng.integers(1, 60))
+    first_correction = floats(loop.observer.first_correction)
     signs = [rng.choice([-1.0, 1.0], M.shape[1]) for M in (noise, pushes)]
     for k in range(count):
         if k % turn == turn - 1:
             signs = [-sign for sign in signs]
         predicted = Ad @ o - Gd @ (pushes @ signs[1]) if k else o
-        o = correction @ predicted + noise @ signs[0]
+        o = (correction if k else first_correction) @ predicted + noise @ signs[0]
         found.append(o)
     return np.array(found)
 
@@ -79,32 +81,31 @@ def largest_share(loop: Loop, bounds: Noise, rate: float, errors: np.ndarray) ->
     """Return the largest share of the bounds that W n reaches in an entry, or ‖W n‖."""
     assert loop.observer is not None
     T = float(loop.observer.period.p) / float(loop.observer.period.q)
-    W, start = floats(loop.weight), floats(bounds.start)[:, 0]
+    W, (columns, rates, start) = floats(loop.weight), map(floats, bounds.smooth)
     sides = np.abs(W @ floats(bounds.columns))
     found = []
     for k, error in enumerate(errors):
         f1 = np.exp(-rate * k * T)
-        rest = error - expm(floats(bounds.smooth) * k * T) @ start if bounds.smooth.nrows() else error
+        rest = error - (columns @ expm(rates * k * T) @ start)[:, 0] if len(rates) else error
         box = sides[:, : bounds.decaying].sum(axis=1) * f1 + sides[:, bounds.decaying :].sum(axis=1)
         norm = float(bounds.sizes[0].mid()) * f1 + float(bounds.sizes[1].mid())
         found += [*(np.abs(W @ rest) / box), float(np.linalg.norm(W @ error)) / norm]
     return max(found)
 
 
-def smooth_of(loop: Loop) -> np.ndarray:
-    from noack.theory.witnesses.assumptions import _smooth
-
-    found = _smooth(loop)
+def smooth_of(loop: Loop, faster: float = 1.0) -> Smooth:
+    found = smooth_part(loop)
     assert found is not None
-    return found
+    columns, rates, start = (np.array(found[name]) for name in ("columns", "rates", "start"))
+    return Smooth(*(matrix(M.tolist()) for M in (columns, rates * faster, start)))
 
 
 @pytest.mark.parametrize("loop", [LOOP, PUSHED])
 @pytest.mark.parametrize("part", ["none", "its own", "another"])
 def test_errors_stay_within_their_bounds_and_come_near(loop: Loop, part: str) -> None:
-    smooth = {"none": None, "its own": smooth_of(loop), "another": smooth_of(loop) * 1.1}[part]
-    bounds = noise_of(loop, RATE, None if smooth is None else matrix(smooth.tolist()))
-    assert bounds.smooth.nrows() == (0 if smooth is None else 2)
+    smooth = {"none": None, "its own": smooth_of(loop), "another": smooth_of(loop, 1.1)}[part]
+    bounds = noise_of(loop, RATE, smooth)
+    assert bounds.smooth.rates.nrows() == (0 if smooth is None else 2)
     rng = np.random.default_rng(0)
     shares = [largest_share(loop, bounds, 0.3, simulated_errors(loop, rng, 400)) for _ in range(40)]
     assert max(shares) <= 1 + 1e-9
@@ -112,7 +113,7 @@ def test_errors_stay_within_their_bounds_and_come_near(loop: Loop, part: str) ->
 
 
 def test_a_smooth_part_leaves_little(witness: Witness) -> None:
-    bounds = [noise_of(LOOP, RATE, M) for M in (None, matrix(smooth_of(LOOP).tolist()))]
+    bounds = [noise_of(LOOP, RATE, smooth) for smooth in (None, smooth_of(LOOP))]
     assert bounds[0].decaying == 2
     assert bounds[1].decaying == 0  # it is added to the constant bounds
     assert float(bounds[1].columns[1, 1].mid()) < 1.02 * float(bounds[0].columns[1, 3].mid())
@@ -123,7 +124,7 @@ def test_a_smooth_part_leaves_little(witness: Witness) -> None:
 def test_bounds_do_not_decay_faster_than_the_error(rate: float) -> None:
     with pytest.raises(RejectedError, match="observer: its error"):
         noise_of(LOOP, number(rate))
-    slow = matrix([[-0.2, 0.0], [0.0, -0.2]])
+    slow = smooth_of(LOOP)._replace(rates=matrix([[-0.2, 0.0], [0.0, -0.2]]))
     with pytest.raises(RejectedError, match="observer: its error"):
         noise_of(LOOP, RATE, slow)
 
@@ -148,13 +149,13 @@ def test_at_rate_0_all_bounds_are_constant() -> None:
 
 def test_the_smooth_part_flows_and_is_in_the_error_after_an_event() -> None:
     smooth = smooth_of(LOOP)
-    model = Model(LOOP, RATE, number(0.8), None, noise_of(LOOP, RATE, matrix(smooth.tolist())), later=1)
+    model = Model(LOOP, RATE, number(0.8), None, noise_of(LOOP, RATE, smooth), later=1)
     rng, n = np.random.default_rng(0), 2
     for place in model.locations:
         z = rng.normal(size=model.size)
         moved = floats(place.flows[0].matrix) @ z
         x, e, s = (floats(rows) for rows in (model.x, model.e, model.s))
-        assert s @ moved == pytest.approx(smooth @ (s @ z))
+        assert s @ moved == pytest.approx(floats(smooth.rates) @ (s @ z))
         # x_s = x + e moves by its model alone.
         assert (x + e) @ moved == pytest.approx(floats(LOOP.H) @ (x + e) @ z)
         assert moved[:n] == pytest.approx(x @ moved)
@@ -162,7 +163,9 @@ def test_the_smooth_part_flows_and_is_in_the_error_after_an_event() -> None:
     for name in ("0 lost, sent", "0 lost, lost", "0 later, event"):
         z = rng.normal(size=model.size)
         after = floats(edges[name].jump) @ z
-        noise = floats(model.s) @ z + floats(model.bounds.columns) @ (floats(model.p) @ z)
+        noise = floats(smooth.columns) @ (floats(model.s) @ z) + floats(model.bounds.columns) @ (
+            floats(model.p) @ z
+        )
         assert floats(model.e) @ after == pytest.approx(noise)
         assert floats(model.s) @ after == pytest.approx(floats(model.s) @ z)
         together = floats(model.x + model.e + model.w)
@@ -192,6 +195,7 @@ CHANGES: dict[str, Callable[[Loop], Loop]] = {
     ),
     "no period": lambda loop: loop._replace(observer=loop.observer._replace(period=fmpq(0))),  # type: ignore[union-attr]
     "a wrong shape": lambda loop: loop._replace(observer=loop.observer._replace(start=zeros(1, 1))),  # type: ignore[union-attr]
+    "another load": lambda loop: loop._replace(loads=1),
     "not finite": lambda loop: loop._replace(
         observer=loop.observer._replace(correction=identity(2) * arb("nan"))  # type: ignore[union-attr]
     ),
@@ -204,10 +208,18 @@ def test_a_loop_that_is_none_is_rejected(witness: Witness, change: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "value", [1, [], {}, {"smooth": 1}, {"smooth": [[1]]}, {"smooth": [["a", 0], [0, 1]]}]
-)
-def test_a_smooth_part_is_a_matrix(witness: Witness, value: object) -> None:
-    rejects(LOOP, {**witness.document, "observer": value}, "observer|smooth")
+    "changes", [{"columns": 1}, {"columns": [[1], [0]]}, {"rates": [[1]]}, {"rates": [["a", 0], [0, 1]]},
+                {"start": [[0.1]]}, {"start": [0.1, 0.2]}, {"start": [[0.1], [0.2, 0.3]]}]
+)  # fmt: skip
+def test_a_smooth_part_has_matrices_that_fit(witness: Witness, changes: dict[str, object]) -> None:
+    document: dict[str, Any] = copy.deepcopy(dict(witness.document))
+    document["observer"] |= changes
+    rejects(LOOP, document, "observer|columns|rates|start")
+
+
+@pytest.mark.parametrize("value", [1, [], {}])
+def test_a_smooth_part_is_a_table(witness: Witness, value: object) -> None:
+    rejects(LOOP, {**witness.document, "observer": value}, "observer|columns")
 
 
 def test_a_document_without_the_smooth_part_proves_nothing(witness: Witness) -> None:
@@ -219,7 +231,7 @@ def test_a_document_without_the_smooth_part_proves_nothing(witness: Witness) -> 
 
 def test_another_smooth_part_is_no_proof_by_the_same_forms(witness: Witness) -> None:
     document: dict[str, Any] = copy.deepcopy(dict(witness.document))
-    document["observer"]["smooth"] = (np.array(document["observer"]["smooth"]) * 1.5).tolist()
+    document["observer"]["rates"] = (np.array(document["observer"]["rates"]) * 1.5).tolist()
     rejects(LOOP, document)
 
 

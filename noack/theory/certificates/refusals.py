@@ -40,6 +40,8 @@ def refusal_under(
         knows_inputs: a run checks which inputs the plant applies, at its start and from its watchdog.
         start_error: as for :class:`CertificateScope`, 0 if it is None there.
     """
+    if resolved.model.load_states:
+        return "model.load: a constant load does not decay; no bound is computed, but one may be proven"
     if not knows_delay and (why := _without_delay(conditions, resolved)) is not None:
         return why
     if not knows_inputs:

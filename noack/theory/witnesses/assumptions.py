@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from flint import fmpq
-from scipy.linalg import expm, logm, solve_continuous_lyapunov
+from scipy.linalg import expm, logm, schur, solve_continuous_lyapunov
 
 from noack.core.linear_systems import Matrix
 from noack.theory.witnesses.coordinates import floats
@@ -37,7 +37,7 @@ _ROOM = 1.01
 _FURTHER = 1.3
 """The next guess exceeds what followed from the last one by this factor."""
 
-_FASTEST, _MOST_TURN = 1e-6, 3.0
+_AT_ONCE, _FASTEST, _MOST_TURN = 1e-3, 1e-6, 3.0
 """An error of an observer that decays, or turns, more between two tests has no smooth part."""
 _NEARLY, _MOST_STEPS = 1 - 1e-4, 30
 """A time is accepted if e_s reaches nearly the threshold."""
@@ -52,8 +52,8 @@ def first_assumptions(loop: Loop, rate: float) -> dict[str, object]:
     document: dict[str, object] = {"rate": rate}
     if not loop.times.period > 0 and (chain := _chain(loop, rate)) is not None:
         document["chain"] = chain
-    if (smooth := _smooth(loop)) is not None:
-        document["observer"] = {"smooth": smooth.tolist()}
+    if (smooth := smooth_part(loop)) is not None:
+        document["observer"] = smooth
     later, at_start = 0, 0
     try:
         require_few_at_start(loop, Assumptions(None, 0, 0, None))
@@ -170,17 +170,29 @@ def _sups(G: Matrix) -> Iterator[float]:
         power = following @ power
 
 
-def _smooth(loop: Loop) -> Matrix | None:
-    """Return Λ with e^{ΛT} = (I − LC) e^{AT}: as the error of the observer decays; None without one."""
-    observer = loop.observer
+def smooth_part(loop: Loop) -> dict[str, object] | None:
+    """Return S, Λ and s(0) with S e^{ΛTk} s(0) as F^k n_0, F = (I − LC) e^{AT}; None: there are none.
+
+    S spans what F does not bring to 0 at once, and Se^{ΛT} = FS.
+    """
+    observer, n = loop.observer, loop.n
     if observer is None or not floats(observer.start).any():
         return None
     period_s = float(observer.period.p) / float(observer.period.q)
     F = floats(observer.correction) @ expm(floats(loop.A) * period_s)
-    values = np.linalg.eigvals(F)
-    if (np.abs(values) < _FASTEST).any() or (np.abs(np.angle(values)) > _MOST_TURN).any():
+    least = _AT_ONCE if loop.loads else 0.0
+    triangle, basis, q = schur(F, sort=lambda re, im: np.hypot(re, im) > least)
+    step, S = triangle[:q, :q], basis[:, :q]
+    values = np.linalg.eigvals(step)
+    if not q or (np.abs(values) < _FASTEST).any() or (np.abs(np.angle(values)) > _MOST_TURN).any():
         return None
-    return np.asarray(logm(F).real / period_s)
+    first = floats(observer.first_correction) @ floats(observer.start)
+    if q == n:
+        S, step = np.eye(n), F
+    else:  # after n steps nothing else is left
+        first = np.linalg.matrix_power(np.linalg.inv(step), n) @ S.T @ np.linalg.matrix_power(F, n) @ first
+    rates = logm(step).real / period_s
+    return {"columns": S.tolist(), "rates": rates.tolist(), "start": first.tolist()}
 
 
 def observer_decay(loop: Loop) -> float:

@@ -60,7 +60,8 @@ class _Runs:
         self._loop, n, N = model.loop, model.loop.n, model.size
         self._rng = np.random.default_rng(0)
         flows = [floats(flow.matrix) for flow in model.locations[0].flows]
-        closed = flows[0][:n, :n]
+        moving = n - self._loop.loads
+        closed = flows[0][:moving, :moving]
         fastest = max(float(np.abs(np.linalg.eigvals(M)).max()) for M in (*flows, closed))
         slowest = max(-float(np.linalg.eigvals(closed).real.max()), 1e-3)
         self._period_s = _seconds(self._loop.times.period)
@@ -82,10 +83,10 @@ class _Runs:
         self._z[:, n : N - 2] = 0
         self._z[:, :n] = floats(self._loop.start)[:, 0]
         smooth = np.flatnonzero(floats(model.s).any(axis=0))
-        self._z[:, smooth] = floats(model.bounds.start)[:, 0][: len(smooth)]
+        self._z[:, smooth] = floats(model.bounds.smooth.start)[:, 0][: len(smooth)]
         spread = float(np.linalg.norm(floats(self._loop.start))) or 1.0
         half = _RUNS // 2
-        self._z[half:, :n] = spread * self._rng.standard_normal((_RUNS - half, n)) / np.sqrt(n)
+        self._z[half:, :moving] = spread * self._rng.standard_normal((_RUNS - half, moving)) / np.sqrt(moving)
         W, threshold = floats(self._loop.weight), float(np.sqrt(self._unit.sum()))
         if np.linalg.norm(W @ flows[0][n : 2 * n, :n]) * spread < _SLOW * slowest * threshold:
             errors = self._rng.standard_normal((_RUNS - half, n)) @ np.linalg.inv(W).T

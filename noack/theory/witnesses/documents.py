@@ -205,8 +205,9 @@ class _Rates:
     """
 
     def __init__(self, loop: Loop, *, slow: float | None = None) -> None:
+        moving = loop.n - loop.loads
         closed = floats(loop.A + loop.B * loop.gain)
-        own = [closed] if loop.holds else [closed, floats(loop.H)]
+        own = [M[:moving, :moving] for M in ([closed] if loop.holds else [closed, floats(loop.H)])]
         self.slowest = min(-float(np.linalg.eigvals(M).real.max()) for M in own)
         self.slowest = min(self.slowest, observer_decay(loop))
         threshold, level = float(loop.rule.rate), float(loop.rule.level)

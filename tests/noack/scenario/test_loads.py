@@ -54,7 +54,7 @@ def test_a_load_at_the_input_is_subtracted_from_the_input() -> None:
 
 
 def test_a_torque_on_a_motor_is_compensated_by_the_voltage_that_the_equations_at_rest_give() -> None:
-    loop = loop_of(resolved("dc_motor_load"))
+    loop = loop_of(resolved("dc_motor", "model.load=[[0.0],[309.4],[0.0]]", 'model.hold=["shaft_angle"]'))
     # at rest: the current holds the torque, i = −309.4 / 8487.18, and the voltage drives it, u = R i
     current = -309.4 / 8487.176310246561
     voltage = 1454545.4545454546 / 363636.36363636365 * current
@@ -83,8 +83,7 @@ def test_the_loop_comes_to_rest_within_the_threshold_and_nothing_is_sent(name: s
     sent_ns = tests["t_ns"][tests["event"] >= 0]
     assert len(sent_ns) < 20
     assert sent_ns[-1] < 0.75 * run.scenario.timing.horizon_ns
-    states = 1 if name == "dc_motor_load" else 4  # the shaft; the current holds the load
-    assert np.linalg.norm(rows["x"][-1][:states]) < run.scenario.decaying.floor
+    assert np.linalg.norm(rows["x"][-1][: run.scenario.model.plant_states]) < run.scenario.decaying.floor
     np.testing.assert_allclose(tests["x"][-1], rows["x"][-1], atol=1e-3)
 
 

@@ -1,0 +1,112 @@
+"""Loops with unknown constant loads: how they are read, what is proven of them, and that runs keep it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
+from cosim.simulation.virtual_time import simulate
+from noack.protocol.record_tables import PLANT_STEP
+from noack.scenario.resolution import resolve
+from noack_check.check import RejectedError
+from noack_check.keys import RefusedError
+from noack_check.proof import prove
+from noack_check.scenario import read_loop
+from tests.checker.runs import floats
+from tests.helpers.resolved_tables import resolved_tables
+from tests.helpers.shipped import resolved, shipped
+
+MOTOR = "dc_motor_load"
+
+
+def motor(*settings: str) -> dict[str, Any]:
+    return dict(resolved_content(resolved(MOTOR, *settings), 2))
+
+
+@pytest.fixture(scope="module")
+def statement() -> WitnessedStatement:
+    found = find_statement(motor(), "own", "schedule")
+    assert found.proof is not None, found.reason
+    return found
+
+
+def test_a_loop_is_read_about_its_rest() -> None:
+    loop = read_loop(motor(), box=False, ideal=False)
+    assert loop.fault() == ""
+    assert loop.loads == 1
+    assert floats(loop.start)[:, 0] == pytest.approx([1.0, 0.0, 0.0])
+    # At rest the voltage holds the load, 309.75 · 0.2 / 2121.8; without an input it pushes the shaft.
+    assert loop.push_before_input is not None
+    assert floats(loop.push_before_input)[:, 0] == pytest.approx([0.0, 309.75 * 0.2, 0.0])
+
+
+def test_the_rest_of_a_load_that_the_input_cannot_cancel_is_the_start_of_the_coordinates() -> None:
+    mass = (
+        "model={A=[[0.0,1.0,0.0],[0.0,0.0,1.0],[0.0,0.0,-5.0]], B=[[0.0],[0.0],[5.0]], "
+        'gain=[[-1.0,-2.0,-1.0]], state_names=["s","v","f"], load=[[0.0],[1.0],[0.0]], hold=["s"]}',
+        "plant={initial_state=[1.0,0.0,0.0], load=[0.3]}", "trigger={beta=0.5,alpha_per_s=0.1,floor=0.01}",
+    )  # fmt: skip
+    tables = resolved_tables("double_integrator", *mass)
+    loop = read_loop(tables, box=False, ideal=False)
+    # The force f = −0.3 holds the load; x − x at rest is (1, 0, 0.3).
+    assert floats(loop.start)[:, 0] == pytest.approx([1.0, 0.0, 0.3, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("plant.load_changes=[{at_s=1.0,load=[0.1]}]", "a constant one"),
+        ("controller.setpoint=[0.5,0.0]", "controller.setpoint"),
+        ("plant.measurement.noise_bound=[0.01,0.01]", "first_gain|observer"),
+    ],
+)
+def test_what_is_not_covered_is_refused(setting: str, message: str) -> None:
+    more = ['observer={kind="luenberger",poles_per_s=[-40.0,-45.0,-50.0]}'] if "noise" in setting else []
+    with pytest.raises(RefusedError, match=message):
+        read_loop(motor(setting, *more), box=False, ideal=False)
+
+
+def test_loads_that_do_not_stay_constant_are_refused() -> None:
+    tables = motor()
+    for table in ("model", "plant"):
+        tables[table]["A"][2] = [0.1, *tables[table]["A"][2][1:]]
+    with pytest.raises(RefusedError, match="not constant"):
+        read_loop(tables, box=False, ideal=False)
+
+
+def test_the_shaft_has_a_proven_bound(statement: WitnessedStatement) -> None:
+    assert statement.bounds is not None
+    bound = statement.bounds.bounds["y[0]"]
+    assert bound.constant < 0.1
+    assert statement.bounds.inter_event_s is not None
+    assert statement.bounds.inter_event_s > 0.004
+
+
+def test_no_simulated_run_exceeds_it(statement: WitnessedStatement) -> None:
+    """The runs are those of noack's machines, of which the checker has nothing."""
+    assert statement.bounds is not None
+    bound, rate, largest = statement.bounds.bounds["y[0]"], statement.bounds.rate_per_s, 0.0
+    losses = [f"network.loss.probability={p}" for p in (0.0, 0.3, 0.6, 1.0)]
+    for seed in range(5):
+        for loss in losses:
+            run = simulate(resolve(shipped(MOTOR, loss, f"seeds.loss={seed}")))
+            rows = run[PLANT_STEP]
+            limit = bound.decaying * np.exp(-rate * rows["t_ns"] * 1e-9) + bound.constant
+            largest = max(largest, float((np.abs(rows["x"][:, 0]) / limit).max()))
+    assert 0.3 < largest <= 1.0
+
+
+def test_the_bound_is_none_of_a_larger_load(statement: WitnessedStatement) -> None:
+    larger = read_loop(motor("plant.load=[2.0]"), box=False, ideal=False)
+    assert statement.document is not None
+    with pytest.raises(RejectedError):
+        prove(larger, statement.document)
+
+
+def test_the_bound_is_none_of_a_slower_observer(statement: WitnessedStatement) -> None:
+    tables = motor()
+    tables["observer"]["gain"][2] = [entry / 10 for entry in tables["observer"]["gain"][2]]
+    assert statement.document is not None
+    with pytest.raises(RejectedError):
+        prove(read_loop(tables, box=False, ideal=False), statement.document)
