@@ -193,9 +193,9 @@ class Loop(NamedTuple):
         if not 0 <= self.loads < n:
             return "loads: not fewer than states"
         constant = range(n - self.loads, n)
-        moving = (self.A, self.B, self.half_A, self.half_B, self.start, self.pushes)
+        moving = [self.A, self.B, self.half_A, self.half_B, self.start, self.pushes]
         if self.push_before_input is not None:
-            moving = (*moving, self.push_before_input)
+            moving.append(self.push_before_input)
         if not all(is_zero(rows_of(M, constant)) for M in moving):
             return "loads: they may change, or are not 0 in these coordinates"
         if self.observer is not None:

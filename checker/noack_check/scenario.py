@@ -172,10 +172,12 @@ def _start(resolved: Table, plants: _Plants, x_r: Sequence[float]) -> _Start:
     n = len(plants.A) - k
     if n < 1:
         raise RefusedError("model.load_states: not fewer than states")
-    matrices = (plants.A, plants.B, plants.half_A, plants.half_B, model["A"], model["B"])
+    of_model = (_matrix(model, "model.A"), _matrix(model, "model.B"))
+    matrices = (plants.A, plants.B, plants.half_A, plants.half_B, *of_model)
     if any(any(row) for M in matrices for row in M[n:]):
         raise RefusedError("model.load_states: the last states are not constant")
-    if any(any(column[n:]) for column in _disturbances(plant, plants)):
+    pushes = _disturbances(plant, matrix(plants.B), matrix(plants.half_B))
+    if any(entry != 0 for column in pushes for entry in column[n:]):
         raise RefusedError("plant.disturbances: the load changes, and its statement is for a constant one")
     if any(map(any, (*plants.half_A, *plants.half_B))):
         raise RefusedError("model.load_states: the statement is for one plant, not for all in a box")
