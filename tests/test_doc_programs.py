@@ -126,6 +126,27 @@ def test_the_tests_of_a_page_pass(tmp_path: Path) -> None:
     assert finished.returncode == 0, finished.stdout
 
 
+@pytest.mark.usefixtures("without_viewer", "no_drawing")
+def test_the_way_of_the_readme_leads_from_a_plant_to_a_live_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its three commands, in their order; the first line of two of them is the sentence that it shows."""
+    monkeypatch.chdir(tmp_path)
+    (code,) = blocks("README.md", "python")
+    Path("servo.py").write_text(code)
+    (way,) = blocks("README.md", "console")
+    shown = next(text for language, text in fences("README.md") if text.startswith("angle stays within"))
+    for line in way.splitlines():
+        _, *words = shlex.split(line.partition("#")[0])
+        more = ["--no-report", "--set=speed=4"] if words[0] == "run" else []
+        finished = invoke(*words, *more)
+        assert finished.exit_code == 0, finished.output
+        if words[0] != "run":
+            assert alike(" ".join(finished.stdout.split())[: len(shown)].strip(), shown.strip())
+        else:
+            assert finished.stdout.startswith("angle was within 0.02 rad of its set-point")
+
+
 # --- the tutorial ---------------------------------------------------------------------------------
 
 PAGE = "docs/tutorial.md"

@@ -88,6 +88,7 @@ def find_witnesses(
     late_periods: int,
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
+    conditions: Sequence[str] = ("ideal", "schedule"),
 ) -> Witnesses:
     """Search for witnesses of a resolved scenario's bounds, for its plant and its uncertainty box.
 
@@ -96,14 +97,11 @@ def find_witnesses(
         late_periods: allowed lateness in steps of the plant.
         progress: called with the completed share.
         most_work: limit of each search, see :class:`noack.theory.witnesses.effort.Effort`.
+        conditions: "ideal" and "schedule", or one of them.
     """
     content = resolved_content(resolved, late_periods)
     has_box = resolved.plant.uncertainty_A is not None or resolved.plant.uncertainty_B is not None
-    wanted = [
-        (plants, under)
-        for under in ("ideal", "schedule")
-        for plants in ("own", *(["box"] if has_box else []))
-    ]
+    wanted = [(plants, under) for under in conditions for plants in ("own", *(["box"] if has_box else []))]
     found: list[WitnessedStatement] = []
     for index, (plants, under) in enumerate(wanted):
         part = partial(_part_of, progress, index, len(wanted))
@@ -120,10 +118,10 @@ def find_region_witnesses(
     late_periods: int,
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
+    conditions: Sequence[str] = ("ideal", "schedule"),
 ) -> Witnesses:
     """Search for witnesses of a plant's equations, as :func:`find_witnesses` for a linear plant."""
-    content, conditions = resolved_content(resolved, late_periods), ("ideal", "schedule")
-    found = []
+    content, found = resolved_content(resolved, late_periods), []
     for index, under in enumerate(conditions):
         part = partial(_part_of, progress, index, len(conditions))
         found.append(find_region_statement(resolved, content, under, part, most_work))
@@ -265,7 +263,7 @@ def known_or_found(
 def _wanted(loop: Loop, *, has_outputs: bool) -> tuple[Sequence[str], Sequence[str]]:
     """Return the outputs to bound from the start on, and in the limit."""
     rows = tuple(f"y[{j}]" for j in range(loop.output_rows.nrows())) if has_outputs else ()
-    outputs = ("x", "e_c", *(rows if loop.outputs.nrows() else ()))
+    outputs = ("x", *(rows if loop.outputs.nrows() else ()), "e_c")  # the drift bounds e_c, too
     return outputs, (("x", *rows) if has_outputs and (loop.sizes or loop.noise.ncols()) else ())
 
 

@@ -212,15 +212,15 @@ def _worst_loop(report: Report) -> Content | None:
 
 
 @section
+def _signals(report: Report) -> Content:
+    return {"figures": [figure for figure in report.figures if figure.name not in PROCESS_FIGURES]}
+
+
+@section
 def _numbers(report: Report) -> Content:
     loop = report.loop.model_copy(update={"replay": None})  # has its own section
     detail = report.detail.model_copy(update={"loops": [loop]})
     return {"numbers": key_numbers(detail), "parameters": [*_parameters(report.scenario)]}
-
-
-@section
-def _signals(report: Report) -> Content:
-    return {"figures": [figure for figure in report.figures if figure.name not in PROCESS_FIGURES]}
 
 
 @section

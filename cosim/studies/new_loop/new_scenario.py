@@ -73,7 +73,7 @@ _LOOSE_BOUND_RATIO = 200.0
 """A bound of ‖x‖ above this multiple of ‖x(0)‖ is used only if there is no other."""
 _DEFAULT_START = 0.1
 """x(0) of a state, if the plant has none."""
-_MOST_THRESHOLDS = 4
+_MOST_THRESHOLDS = 3
 """Last thresholds that are tried for the allowed errors."""
 _LEAST_USE, _MOST_USE = 0.6, 0.85
 """Shares of an allowed error that its bound has in the end: at least, and wanted."""
@@ -350,7 +350,7 @@ class _TrialScenarios:
         for number in range(_MOST_THRESHOLDS):
             report(f"searching for proofs{f': threshold {number + 1}' if number else ''}")
             results = certificates_of(self.scenario(trial), of_model=True)
-            results.prove(most_work=RUN_WORK)
+            results.prove(most_work=2 * RUN_WORK, conditions=("schedule",))
             certificate = results.guaranteed
             used = results.scenario.trigger
             if certificate is None or is_fixed or not isinstance(used, DecayingSettings):
