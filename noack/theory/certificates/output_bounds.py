@@ -59,8 +59,8 @@ class OutputBound(NamedTuple):
 
     @property
     def is_met(self) -> bool:
-        """Whether the allowed error, if there is one, is certified."""
-        return self.output.allowed is None or self.settles_s is not None
+        """Whether the allowed error, if there is one, is certified: from some time on, or in the end."""
+        return self.output.allowed is None or self.ultimate <= self.output.allowed
 
     @property
     def statement(self) -> str:
@@ -72,6 +72,8 @@ class OutputBound(NamedTuple):
         if settles_s is not None:
             when = f"from {at_most(settles_s, _DIGITS)} s on" if settles_s else "at all times"
             return f"{output.name} stays within {allowed} of its {self.target} {when}"
+        if self.is_met:
+            return f"{output.name} stays within {allowed} of its {self.target} in the end"
         least = output.quantity(at_most(self.ultimate, _DIGITS))
         return f"{output.name} stays within {least} of its {self.target} in the end, not within {allowed}"
 

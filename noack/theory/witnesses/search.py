@@ -15,6 +15,10 @@ from noack.theory.witnesses.semidefinite import Accuracy, MatrixInequality, Solv
 from noack.theory.witnesses.templates import Template, Templates
 
 
+_CONSTANT_WEIGHT = 100.0
+"""Of D₂² of an output."""
+
+
 class Found(NamedTuple):
     """A solution in the model's own coordinates; the bound is D₁² and D₂²."""
 
@@ -47,8 +51,8 @@ class Search:
     ) -> Found | None:
         """Return the smallest bound of an output for a ν: from the start on, or in the limit.
 
-        Minimised is D₁² + D₂² from the start on, and D₂² in the limit. D₁ and D₂ of the drift are
-        divided by the thresholds c and f of their units: the time between events depends on these quotients.
+        Minimised is D₁² + D₂² from the start on, and D₂² in the limit. D₂ of an output weighs more: it decides
+        from when on the output is within its allowed error. D₁ and D₂ of the drift are divided by the thresholds c and f of their units: the time between events depends on these quotients.
         """
         size = self._output_size(output)
         items = self.templates.at(decay, output, starts=starts)
@@ -77,7 +81,7 @@ class Search:
         level, floor = float(self.model.level), float(self.model.floor)
         if output == "drift" and level and floor:
             return {"level 1": floor / level, "level 2": level / floor}
-        return {"level 1": 1.0, "level 2": 1.0}
+        return {"level 1": 1.0, "level 2": _CONSTANT_WEIGHT if output.startswith("y[") else 1.0}
 
     def _output_size(self, output: str) -> float:
         index = min(1, len(self.model.locations) - 1)
