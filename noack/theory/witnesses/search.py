@@ -14,7 +14,6 @@ from noack.theory.witnesses.coordinates import Frames, floats
 from noack.theory.witnesses.semidefinite import Accuracy, MatrixInequality, SolverAnswer, minimise
 from noack.theory.witnesses.templates import Template, Templates
 
-
 _CONSTANT_WEIGHT = 100.0
 """Of D₂² of an output."""
 
@@ -51,8 +50,9 @@ class Search:
     ) -> Found | None:
         """Return the smallest bound of an output for a ν: from the start on, or in the limit.
 
-        Minimised is D₁² + D₂² from the start on, and D₂² in the limit. D₂ of an output weighs more: it decides
-        from when on the output is within its allowed error. D₁ and D₂ of the drift are divided by the thresholds c and f of their units: the time between events depends on these quotients.
+        Minimised is D₁² + D₂² from the start on, and D₂² in the limit. D₂ of an output weighs more: it
+        decides from when on the output is within its allowed error. D₁ and D₂ of the drift are divided
+        by the thresholds c and f of their units: the time between events depends on these quotients.
         """
         size = self._output_size(output)
         items = self.templates.at(decay, output, starts=starts)
