@@ -34,6 +34,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.system
 def test_the_documented_extension_is_built_installed_and_used(folder: Path) -> None:
     environment = {**os.environ, NO_EXTENSIONS: "", "PYTHONPATH": str(folder / "installed")}
 
@@ -52,10 +53,3 @@ def test_the_documented_extension_is_built_installed_and_used(folder: Path) -> N
     first, second = (folder / "peaks.txt").read_text().splitlines()
     assert re.fullmatch(r"swing \w+ 0\.5", first)  # it begins at its largest angle
     assert re.fullmatch(r"swing \w+ [\d.]+", second)
-
-
-def test_it_has_at_most_sixty_lines() -> None:
-    files = [*blocks(PAGE, "toml"), *blocks(PAGE, "python")]
-    lines = [text.strip().splitlines()[1:] for text in files if text.startswith("# noack-swing/")]
-    assert len(lines) == 4
-    assert sum(map(len, lines)) <= 60
