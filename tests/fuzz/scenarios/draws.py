@@ -21,6 +21,7 @@ NEVER_DRAWN: Mapping[str, str] = {
     "ModelSection.load_states": "of resolved scenarios, which have the loads in their matrices",
     "ModelSection.controller_states": "of resolved scenarios, which have these states in their matrices",
     "StateSpaceSettings.setpoint": "refused: the state is computed from the measured x",
+    "StateSpaceSettings.reference": "refused: the state is computed from the measured x",
     "PythonControllerSettings.sha256": "the user's own copy in a run directory",
     "PythonPlantSettings.sha256": "the user's own copy in a run directory",
     "PythonTriggerSettings.sha256": "the user's own copy in a run directory",
