@@ -4,14 +4,32 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import frobenius, identity, is_zero, rows_of, stack, zeros
+from noack_check.balls import columns_of, frobenius, identity, is_positive, is_zero, rows_of, stack, zeros
 
 _MOST_STATES, _MOST_LOSSES = 40, 1000
 """A proof of a larger loop would take hours."""
 
 
+class Memory(NamedTuple):
+    """A number η that a rule keeps between tests, whose positive part the rule's right side has in addition.
+
+    From one test to the next one, T later, η becomes e^{−λT} η + (1 − e^{−λT})/λ · zᵀΨz with z = (x, e_s) at
+    the first of both.
+    """
+
+    decay: arb  # λ, 1/s
+    gain: arb_mat  # Ψ, symmetric, as many rows as z has
+    start: arb  # η at t = 0, before z of this time counts
+
+    def starts_positive(self, n: int) -> bool:
+        """Return whether η ≥ 0 at the first test: e_s is 0 at t = 0."""
+        return is_positive(rows_of(columns_of(self.gain, range(n)), range(n)))
+
+
 class Rule(NamedTuple):
-    """The trigger's rule: with z = (x, e_s), an event needs ‖P z‖² > max(c e^{−ρt}, f)² + ‖N z‖².
+    """The trigger's rule: with z = (x, e_s), an event needs ‖P z‖² > max(c e^{−ρt}, f)² + ‖N z‖² + η⁺.
+
+    If it is ``of_input``, z is (x, K e_s), also for Ψ, with n + m entries.
 
     ``always`` says that events may also come without the comparison, as after a deadline.
     """
@@ -22,6 +40,8 @@ class Rule(NamedTuple):
     rate: arb  # ρ, 1/s
     floor: arb  # f
     always: bool = False
+    memory: Memory | None = None  # of η; None: η = 0
+    of_input: bool = False
 
 
 class Times(NamedTuple):
@@ -41,11 +61,13 @@ class Times(NamedTuple):
     """Two events of a periodic rule, which compares nothing, are at least this far apart."""
     period: fmpq = fmpq(0)
     """They are at most this far apart; 0 for other rules."""
+    dwell: fmpq = fmpq(0)
+    """If it is not 0, the first test that counts after an event comes exactly this time after it."""
 
     @property
     def least_apart(self) -> fmpq:
         """Two events are at least this far apart, whatever is measured."""
-        return self.least_period if self.period > 0 else self.least_sampling
+        return self.least_period if self.period > 0 else max(self.least_sampling, self.dwell)
 
 
 class Observer(NamedTuple):
@@ -151,6 +173,27 @@ class Loop(NamedTuple):
         return not (rate == 0 and self.needs_constant)
 
     @property
+    def needs_tests_apart(self) -> bool:
+        """Whether only a model covers the rule in which tests are an exact time apart."""
+        return self.rule.memory is not None or self.times.dwell > 0
+
+    @property
+    def seen(self) -> arb_mat | None:
+        """G, (q, n), if nothing depends on errors but through G e, where the models hold the last update.
+
+        None: it may depend on all entries.
+        """
+        n, m, rule, memory = self.n, self.gain.nrows(), self.rule, self.rule.memory
+        if not self.holds:
+            return None
+        if rule.of_input:
+            return self.gain if m < n else None
+        columns = [rule.positive, rule.negative, *([] if memory is None else [memory.gain])]
+        parts = [self.gain, *(columns_of(M, range(n, 2 * n)) for M in columns)]
+        seen = [i for i in range(n) if not all(is_zero(columns_of(M, [i])) for M in parts)]
+        return rows_of(identity(n), seen) if 0 < len(seen) < n else None
+
+    @property
     def H(self) -> arb_mat:
         """What the models integrate."""
         closed = self.model_A + self.model_B * self.gain
@@ -177,7 +220,11 @@ class Loop(NamedTuple):
             matrices |= {"first correction": self.observer.first_correction}
         if self.push_before_input is not None:
             shapes["push"], matrices["push"] = (n, 1), self.push_before_input
-        shapes |= {name: (matrices[name].nrows(), 2 * n) for name in ("rule.positive", "rule.negative")}
+        compared = n + m if rule.of_input else 2 * n
+        shapes |= {name: (matrices[name].nrows(), compared) for name in ("rule.positive", "rule.negative")}
+        if rule.memory is not None:
+            shapes["rule.memory.gain"] = (compared, compared)
+            matrices["rule.memory.gain"] = rule.memory.gain
         for name, M in matrices.items():
             if (M.nrows(), M.ncols()) != shapes[name]:
                 return f"{name}: not {' x '.join(map(str, shapes[name]))}"
@@ -185,6 +232,8 @@ class Loop(NamedTuple):
                 return f"{name}: not finite"
         sizes = {"rule.level": rule.level, "rule.floor": rule.floor}
         sizes |= {f"sizes[{i}]": size for i, size in enumerate(self.sizes)}
+        if rule.memory is not None:
+            sizes |= {"rule.memory.decay": rule.memory.decay, "rule.memory.start": rule.memory.start}
         halves = (*self.half_A.entries(), *self.half_B.entries())
         sizes |= {f"half-width {i}": half for i, half in enumerate(halves)}
         for name, size in sizes.items():
@@ -216,6 +265,16 @@ class Loop(NamedTuple):
             return "times: events of a periodic rule further apart than they may be, or at once"
         if times.period > 0 and times.least_period < times.least_sampling:
             return "times: events between tests"
+        if rule.of_input and not self.needs_tests_apart:
+            return "rule: of the input, and tested at any times"
+        if self.needs_tests_apart and not times.sampling == times.least_sampling > 0:
+            return "rule: needs tests at times that are a known time apart"
+        if times.dwell > 0 and (times.dwell < times.sampling or times.period > 0):
+            return "times: a dwell time that ends before the next test, or of a periodic rule"
+        if rule.memory is not None and not rule.memory.starts_positive(n):
+            return "rule: a memory that may begin below 0"
+        if rule.memory is not None and times.dwell > times.sampling:
+            return "rule: a memory that changes during a dwell time"
         if times.sampling == 0 and not is_zero(rule.positive * stack([identity(n), zeros(n, n)])):
             return "rule: tested at all times, it may hold at once after an event"
         return ""

@@ -27,6 +27,12 @@ location a clock shows the time since the last event, at which the next one happ
 the error of the newest update if this one is lost; so in "j lost" x_s is x_c: w = 0, and the event of
 an update that is lost changes no error.
 
+If tests are T apart, exactly, V may depend on where each update is at each test: see
+:mod:`.tests_apart`. Rules with a dwell time, and those with a memory η, need this. Then z has a number y
+more with y² = max(η, 0), as it will be at the next test. It is the same until then; at a test η becomes
+e^{−λT} η + (1 − e^{−λT})/λ zᵀΨz. So y² becomes 0, or at most this with y² for η: V does not grow in either
+case, with coefficients of y² that are at least 0.
+
 At most M − 1 consecutive updates are lost, and at most ``later`` events are assumed to happen within d
 after an event. :mod:`.proof` shows both assumptions from bounds of the same loop, by induction over the
 events.
@@ -65,7 +71,8 @@ from noack_check.balls import (
     upto,
     zeros,
 )
-from noack_check.loop import Along, Loop, Noise
+from noack_check.loop import Along, Loop, Memory, Noise
+from noack_check.tests_apart import Move, Place, Places
 
 _CLOSE = 1000
 """Nodes of a periodic rule's clock are at least such a share of the period apart."""
@@ -118,6 +125,8 @@ class Edge(NamedTuple):
     facts: tuple[arb_mat, ...]
     is_test: bool
     """z has the noise of a measurement."""
+    memory: arb_mat | None = None
+    """Symmetric Q: y² becomes zᵀQz; None: it stays."""
 
 
 class Chain(NamedTuple):
@@ -191,7 +200,8 @@ class Model:
         noise: bounds of n; by default those without an observer.
         later: most events within d after an event.
         later_at_start: most events after the one at t = 0 before the first input acts.
-        pieces: of the period of a periodic rule, on which P is affine.
+        pieces: of the period of a periodic rule, or of the time between tests, on which P is affine.
+        by_tests: V depends on where each update is at each test, which is at an exact time.
         is_exact: with False a coarse approximation of K e^{−Hs} replaces its hull, for a search.
     """
 
@@ -206,26 +216,38 @@ class Model:
         later: int = 0,
         later_at_start: int = 0,
         pieces: int = 1,
+        by_tests: bool = False,
         is_exact: bool = True,
     ) -> None:
         self.loop, self.rate, self.decay, self.errors = loop, rate, decay, errors
         self.later, self.is_exact = later, is_exact
         self.later_at_start = later_at_start
         self.is_periodic = loop.times.period > 0
+        self._pieces, self.memory = pieces, loop.rule.memory
+        self._places = None
+        if by_tests or loop.needs_tests_apart:
+            self._places = Places(loop.losses, loop.times, later, later_at_start)
         self._clock = self._clock_nodes(pieces) if self.is_periodic else []
         n, copies = loop.n, max(later, later_at_start)
+        seen = loop.seen if self._places is not None else None
+        self.sees_all = seen is None
+        self._seen = identity(n) if seen is None else seen
+        q, lift = self._seen.nrows(), self._right_inverse()
         if noise is None and loop.observer is not None:
             raise ValueError("noise: that of the observer is missing")
         self.bounds = noise = noise or loop.plain_noise
-        smooth = range((3 + copies) * n, (3 + copies) * n + noise.smooth.rates.nrows())
+        smooth = range(n + (2 + copies) * q, n + (2 + copies) * q + noise.smooth.rates.nrows())
         self._sources = range(smooth.stop, smooth.stop + noise.columns.ncols())
-        self.size = self._sources.stop + 2
+        memories = range(self._sources.stop, self._sources.stop + (self.memory is not None))
+        self.size = memories.stop + 2
         every = identity(self.size)
-        vectors = [rows_of(every, range(i, i + n)) for i in range(0, smooth.start, n)]
-        self.x, self._error, self.w, *self.v = vectors
-        self._moving = rows_of(self.x, range(n - loop.loads))
+        self.x = rows_of(every, range(n))
+        self._errors = [rows_of(every, range(i, i + q)) for i in range(n, smooth.start, q)]
+        self._error, self.w, *self.v = self._errors if seen is None else [lift * e for e in self._errors]
         self.s, self.p = rows_of(every, smooth), rows_of(every, self._sources)
+        self._moving = rows_of(self.x, range(n - loop.loads))
         self._decaying = noise.smooth.columns * self.s if smooth else 0 * self.x
+        self.y = rows_of(every, memories)
         self.e = self._error + self._decaying if smooth else self._error
         self.f1, self.f2 = (rows_of(every, [self.size - 2 + i]) for i in range(2))
         self.noise = 1 * self._decaying
@@ -239,10 +261,18 @@ class Model:
         self.silent = self._comparison(self.level, self.floor)
         self._guards = self._event_guards()
         self._forms: dict[tuple[int, int], Form] = {}
-        self.locations = self._locations()
-        self.edges = self._edges()
+        self.locations = self._locations() if self._places is None else self._locations_by_tests(self._places)
+        self.edges = self._edges() if self._places is None else self._edges_by_tests(self._places)
 
     # The system.
+
+    def _right_inverse(self) -> arb_mat:
+        """Return R with GR = 1: e may be taken for R G e."""
+        G = self._seen
+        return transpose(G) * (G * transpose(G)).inv() if not self.sees_all else G
+
+    def _reduced(self, errors: arb_mat) -> arb_mat:
+        return errors if self.sees_all else self._seen * errors
 
     def _event_guards(self) -> Mapping[str, arb_mat]:
         """Return by unit what is ≤ 0 at events: that the rule's comparison exceeds the unit's threshold.
@@ -263,13 +293,18 @@ class Model:
     def _comparison(self, level: arb, floor: arb) -> arb_mat:
         """Return ‖P z‖² − ‖N z‖² − c² f₁² − f² f₂² of what is measured."""
         rule = self.loop.rule
-        form = self._measured(rule.positive) - self._measured(rule.negative)
+        form = self._measured(rule.positive) - self._measured(rule.negative) - square(self.y)
         return form - level**2 * square(self.f1) - floor**2 * square(self.f2)
 
     def _measured(self, rows: arb_mat) -> arb_mat:
         """Return the square of some rows of a measurement and its error."""
-        pair = stack([self.x + self.noise, self.e - self.noise])
-        return square(rows * pair) if rows.nrows() else zeros(self.size, self.size)
+        return square(rows * self._pair) if rows.nrows() else zeros(self.size, self.size)
+
+    @property
+    def _pair(self) -> arb_mat:
+        """A measurement, and its error."""
+        error = self.e - self.noise
+        return stack([self.x + self.noise, self.loop.gain * error if self.loop.rule.of_input else error])
 
     def threshold_squared(self) -> arb_mat:
         """Return c² f₁² + f² f₂², at least the square of the threshold."""
@@ -348,9 +383,10 @@ class Model:
         """Return those of x, e, w, some v and the units."""
         n, first = self.loop.n, self.size - 2
         units = ([first] if self._has_f1 else []) + ([first + 1] if self.loop.needs_constant else [])
-        w, s = range(2 * n, 3 * n) if has_w else range(0), self._sources.start - self.s.nrows()
-        x_and_e = (*range(n - self.loop.loads), *range(n, 2 * n))
-        return (*x_and_e, *w, *range(3 * n, (3 + copies) * n), *range(s, self._sources.start), *units)
+        q, s = self._seen.nrows(), self._sources.start - self.s.nrows()
+        w, v = range(n + q, n + 2 * q) if has_w else range(0), range(n + 2 * q, n + (2 + copies) * q)
+        known = (*range(n - self.loop.loads), *range(n, n + q), *w, *v, *range(s, self._sources.start))
+        return (*known, *range(self._sources.stop, first), *units)
 
     def _units(self) -> set[str]:
         """Return the names of c of all units."""
@@ -409,8 +445,9 @@ class Model:
             if self.s.nrows():
                 smooth = self.bounds.smooth.rates * self.s
                 error -= self.bounds.smooth.columns * smooth
-            units = 0 * self.p, -self.rate * self.f1, 0 * self.f2
-            matrix = stack([velocity, error, H * self.w, *copies, smooth, *units])
+            units = 0 * self.p, 0 * self.y, -self.rate * self.f1, 0 * self.f2
+            moved = [self._reduced(each) for each in (error, H * self.w, *copies)]
+            matrix = stack([velocity, *moved, smooth, *units])
             found.append(Flow(matrix, (*self._unknowns(u), *further), u))
         return tuple(found)
 
@@ -434,7 +471,7 @@ class Model:
 
     def _push(self, column: arb_mat) -> arb_mat:
         """Return the column of ż for one of ẋ."""
-        return transpose(self.x) * column - transpose(self._error) * column
+        return transpose(self.x) * column - transpose(self._errors[0]) * self._reduced(column)
 
     @property
     def _waiting(self) -> int:
@@ -503,7 +540,97 @@ class Model:
         """Return z after a jump; other vectors than these become 0."""
         rest = [0 * self.w] * (len(self.v) - len(v))
         error = e - self._decaying if self.s.nrows() else e
-        return stack([self.x, error, w, *v, *rest, self.s, self.p, self.f1, self.f2])
+        errors = [self._reduced(each) for each in (error, w, *v, *rest)]
+        return stack([self.x, *errors, self.s, self.p, self.y, self.f1, self.f2])
+
+    # Tests at exact times.
+
+    @property
+    def is_by_tests(self) -> bool:
+        """Whether V depends on where each update is at each test."""
+        return self._places is not None
+
+    def _locations_by_tests(self, places: Places) -> list[Location]:
+        flows = self._flows(self._gains())
+        no_input = self._flows([0 * self.loop.gain], self._before_input())
+        found = []
+        for place in places.places:
+            nodes = tuple(arb(node) for node in places.nodes(place, self._pieces))
+            coordinates = self._coordinates(
+                place.has_input and (place.lost > 0 or bool(place.ages)), place.later
+            )
+            moves = flows if place.has_input else no_input
+            found.append(Location(self._place_name(place), coordinates, nodes, moves, (), (), False))
+        return found
+
+    def _place_name(self, place: Place) -> str:
+        """Return "1 lost", or "1 later, 2 0 tests ago": the times since the events on their way."""
+        parts = [f"{place.later} later" if place.ages else f"{place.lost} lost"]
+        if not place.has_input:
+            parts.insert(0, "start")
+        if place.ages:
+            ages = (float(arb(age / self.loop.times.sampling)) for age in place.ages)
+            parts.append(f"{' '.join(f'{age:g}' for age in ages)} tests ago")
+        return ", ".join([*parts, "dwells"] if place.dwells else parts)
+
+    def _edges_by_tests(self, places: Places) -> list[Edge]:
+        found = []
+        indices = {place: index for index, place in enumerate(places.places)}
+        for move in places.moves:
+            source, target = indices[move.source], indices[move.target]
+            name = f"{self.locations[source].name}, {move.kind}, {self.locations[target].name}"
+            nodes, others = self.locations[source].nodes, self.locations[target].nodes
+            pairs: tuple[tuple[int, int], ...] = ((len(nodes) - 1, 0),)
+            if move.kind == "arrival":
+                pairs = tuple((node, node) for node in range(min(len(nodes), len(others))))
+            facts = self._facts_of_test(move)
+            jump, is_test = self._jump_of(move), move.kind != "arrival"
+            if self.memory is None or not is_test:
+                found.append(Edge(name, source, target, pairs, jump, facts, is_test))
+                continue
+            following = self._next_memory(self.memory, places.clock_end(move.target))
+            grown, none = (*facts, -1 * following), (*facts, following)
+            found.append(Edge(name, source, target, pairs, jump, grown, is_test, following))
+            nothing = zeros(self.size, self.size)
+            found.append(Edge(f"{name}, none", source, target, pairs, jump, none, is_test, nothing))
+        return found
+
+    def _facts_of_test(self, move: Move) -> tuple[arb_mat, ...]:
+        if move.kind == "arrival":
+            return ()
+        if move.is_event:
+            return (*self._guards.values(), *self._noise_bounds)
+        return (self.silent, *self._noise_bounds)
+
+    def _jump_of(self, move: Move) -> arb_mat:
+        """Return what becomes of z; see the edges of loops whose tests may be at any time."""
+        place, added = move.source, self.e - self.noise
+        if move.kind == "silent":
+            return identity(self.size)
+        if move.kind == "arrival":
+            w = self.v[0] if place.later else 0 * self.w
+            return self.jump(self.e, w, self.v[place.later - move.target.later : place.later])
+        if move.kind in ("delivered", "first"):
+            return self.jump(self.noise, 0 * self.w, ())
+        copies = [*(v + added for v in self.v[: place.later]), added] if move.kind == "later" else []
+        return self.jump(self.noise, self.w + added, copies)
+
+    def _next_memory(self, memory: Memory, until: fmpq) -> arb_mat:
+        """Return η at the next test, with y² for η, as a form of z."""
+        eta, decay = square(self.y), (-1 * memory.decay * until).exp()
+        gained = arb(until) if memory.decay == 0 else (1 - decay) / memory.decay
+        return decay * eta + gained * (transpose(self._pair) * memory.gain * self._pair)
+
+    def memory_after_test(self) -> arb_mat:
+        """Return the form of η after a test; 0 for a rule without a memory."""
+        if self.memory is None:
+            return zeros(self.size, self.size)
+        return self._next_memory(self.memory, self.loop.times.sampling)
+
+    @property
+    def memory_at_start(self) -> float:
+        """The root of η(0), before the first test."""
+        return 0.0 if self.memory is None else float(self.memory.start.sqrt().mid())
 
     @property
     def _has_silent_edges(self) -> bool:
@@ -524,13 +651,14 @@ class Model:
         has a form of x, e and w of its own, and with a periodic rule each node of each location.
         """
         if (location, node) not in self._forms:
-            self._forms[location, node] = self._new_form(location, node)
+            new = self._new_form if self._places is None else self._form_by_tests
+            self._forms[location, node] = new(location, node)
         return self._forms[location, node]
 
     def _new_form(self, location: int, node: int) -> Form:
         place = self.locations[location]
         rule, E = self.loop.rule, columns_of(identity(self.size), place.coordinates)
-        errors = stack([f for f in (self._error, self.w, *self.v) if not is_zero(f * E)])
+        errors = stack([f for f in self._errors if not is_zero(f * E)])
         by_node = self.is_periodic or not place.is_tested
         own = f"{place.name}, {node}" if by_node else place.name
         starts = place.name.startswith("start")
@@ -558,6 +686,32 @@ class Model:
                     scalars.append((f"a/{own}{name}", -1 * place.nodes[node] * transpose(E) * M * E))
         return Form(parts, tuple(scalars))
 
+    def _form_by_tests(self, location: int, node: int) -> Form:
+        """Return P + T P' of (x, s, e, w, …) with P common to all places with as many lost or later updates.
+
+        T is the time to the next test, and P' belongs to the node. So all matrices of a witness are about
+        as large, however small T is. The same holds for the coefficients of f₁², f₂² and y².
+        """
+        place, names = self.locations[location], self._names_by_tests(location, node)
+        E = columns_of(identity(self.size), place.coordinates)
+        rows = stack([self.x, self.s, *(f for f in self._errors if not is_zero(f * E))]) * E
+        squares = [("c1", -1 * square(self.f1 * E)), ("c2", -1 * square(self.f2 * E))]
+        squares = [(letter, M) for letter, M in squares if not is_zero(M)]
+        if self.memory is not None:
+            squares.append(("eta", square(self.y * E)))
+        parts = tuple((f"P/{name}", size.sqrt() * rows) for name, size in names)
+        return Form(
+            parts, tuple((f"{letter}/{name}", size * M) for letter, M in squares for name, size in names)
+        )
+
+    def _names_by_tests(self, location: int, node: int) -> list[tuple[str, arb]]:
+        """Return the names of P and P', with their factors; of P alone where it is first used."""
+        place, kinds = self.locations[location], [_kind(each.name) for each in self.locations[: location + 1]]
+        common = (kinds[-1], arb(1))
+        if node == 0 and kinds.count(kinds[-1]) == 1:
+            return [common]
+        return [common, (f"{place.name}, {node}", place.nodes[-1])]
+
     # The inequalities.
 
     def inequalities(self, output: str, *, starts: bool) -> Iterator[Inequality]:
@@ -576,6 +730,19 @@ class Model:
             yield from self._flow_inequalities(index)
         for edge in self.edges:
             yield from self._edge_inequalities(edge)
+        if self.memory is not None:
+            yield from (self._memory_inequality(index) for index in range(len(self.locations)))
+
+    def _memory_inequality(self, index: int) -> Inequality:
+        """The coefficient of y² after a test is at least 0."""
+        terms = _Terms(1)
+        self._add_memory(terms, index, 0, identity(1))
+        return terms.inequality(f"memory/{self.locations[index].name}", index, -1)
+
+    def _add_memory(self, terms: "_Terms", location: int, node: int, M: arb_mat) -> None:
+        """Add the coefficient of y² times M."""
+        for name, size in self._names_by_tests(location, node):
+            terms.scalar(f"eta/{name}", size * M)
 
     def output_inequalities(self, output: str) -> Iterator[Inequality]:
         """Yield those of an output; the drift has none before the first input."""
@@ -676,7 +843,10 @@ class Model:
         """
         source, target = self.locations[edge.source], self.locations[edge.target]
         E = self._columns(source, with_noise=edge.is_test)
-        z, jump = rows_of(E, source.coordinates), rows_of(edge.jump * E, target.coordinates)
+        z, motion = rows_of(E, source.coordinates), edge.jump * E
+        if edge.memory is not None:
+            motion -= transpose(self.y) * self.y * motion
+        jump = rows_of(motion, target.coordinates)
         facts = edge.facts
         if self._units() <= set(self._guards):
             facts += source.facts + (() if self._sources else source.silent)
@@ -684,6 +854,9 @@ class Model:
             terms = _Terms(E.ncols())
             terms.add(self.form(edge.source, node), z, z, arb(1) / 2)
             terms.add(self.form(edge.target, target_node), jump, jump, arb(-1) / 2)
+            if edge.memory is not None:
+                after = -1 * (transpose(E) * edge.memory * E)
+                self._add_memory(terms, edge.target, target_node, after)
             name = f"edge/{edge.name}/{node} {target_node}"
             terms.facts(f"m/{name}", facts, E)
             yield terms.inequality(name, edge.source, 0)
@@ -693,8 +866,10 @@ class Model:
         return columns_of(identity(self.size), (*place.coordinates, *(self._sources if with_noise else ())))
 
     def start_inequality(self) -> Inequality:
-        """V(z(0)) ≤ Σ m q: e = n at the start, for all p. The columns of z are a constant, and p."""
+        """V(z(0)) ≤ Σ m q: e = n at the start, for all p; η ≥ 0. The columns of z are a constant, and p."""
         index = self.loop.losses + 1 + self._waiting if self.loop.times.start > 0 else 0
+        if self._places is not None:
+            index = self._places.places.index(self._places.start)
         z = transpose(self.x) * self.loop.start + transpose(self.f1) + transpose(self.f2)
         if self.s.nrows():
             z += transpose(self.s) * self.bounds.smooth.start
@@ -703,6 +878,11 @@ class Model:
         at_start = rows_of(z, self.locations[index].coordinates)
         terms = _Terms(z.ncols())
         terms.add(self.form(index, 0), at_start, at_start, arb(-1) / 2)
+        if self.memory is not None and self._places is not None:
+            until, root = self._places.clock_end(self._places.places[index]), self.memory.start.sqrt()
+            Q = self._next_memory(self.memory, until)
+            z_eta = z + transpose(self.y) * arb_mat(1, z.ncols(), [root] + [0] * (z.ncols() - 1))
+            self._add_memory(terms, index, 0, -1 * (transpose(z_eta) * Q * z_eta))
         terms.facts("m/start", self._noise_bounds, z)
         return terms.inequality("start", index, -1)
 
@@ -719,6 +899,11 @@ def _corners(K: arb_mat, H: arb_mat, q: arb, degree: int) -> tuple[list[arb_mat]
         shares = [arb(comb(i, k)) / comb(degree, k) for k in range(i + 1)]
         points.append(sum((share * term for share, term in zip(shares, terms, strict=False)), 0 * K))
     return points, rest
+
+
+def _kind(name: str) -> str:
+    """Return "1 lost", "2 later" or "start, 2 later", with ", dwells" after an event with a dwell time."""
+    return ", ".join(part for part in name.split(", ") if not part.endswith(" ago"))
 
 
 def is_same(part: Part, other: Part) -> bool:

@@ -20,7 +20,7 @@ Both are proven from bounds of this model, by induction over the events: all bou
 
 from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
@@ -126,6 +126,14 @@ class Assumptions(NamedTuple):
     """Parts of the period of a periodic rule: the nodes of its clock."""
     noise: Noise | None = None
     """Of an observer."""
+    by_tests: bool = False
+    """V depends on where each update is at each test."""
+
+    @property
+    def of_model(self) -> dict[str, Any]:
+        """Further arguments of the model."""
+        names = ("later", "later_at_start", "pieces", "by_tests")
+        return {name: getattr(self, name) for name in names}
 
 
 def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> Assumptions:
@@ -144,11 +152,16 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     if pieces < 1:
         raise RejectedError("pieces: below 1")
     smooth = _read_smooth(loop, document) if "observer" in document else None
-    noise = noise_of(loop, rate, smooth)
+    noise, by_tests = noise_of(loop, rate, smooth), document.get("by_tests", False)
+    if by_tests and (loop.times.period > 0 or not loop.times.sampling == loop.times.least_sampling > 0):
+        raise RejectedError("by_tests: the tests are not an exact time apart")
+    if (by_tests or loop.needs_tests_apart) and loop.loads:
+        raise RejectedError("by_tests: not with unknown loads")
+    by_tests = bool(by_tests) or loop.needs_tests_apart
     if "errors" not in document:
-        return Assumptions(None, later, at_start, chain, pieces, noise)
-    if loop.times.period > 0:
-        raise RejectedError("errors: of no use with a periodic rule")
+        return Assumptions(None, later, at_start, chain, pieces, noise, by_tests)
+    if loop.times.period > 0 or by_tests:
+        raise RejectedError("errors: of no use with a periodic rule, or with forms of each test")
     table = document["errors"]
     if not isinstance(table, Mapping):
         raise RejectedError("errors: not a table")
@@ -301,21 +314,20 @@ def weighted(loop: Loop, rate: arb) -> arb_mat:
 
 def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Assumptions) -> Bound:
     """Return the bound of one output, after verifying its inequalities."""
-    model = Model(
-        loop,
-        rate,
-        read_number(entry, "decay"),
-        assumed.errors,
-        assumed.noise,
-        later=assumed.later,
-        later_at_start=assumed.later_at_start,
-        pieces=assumed.pieces,
-    )
+    decay = read_number(entry, "decay")
+    try:
+        model = Model(loop, rate, decay, assumed.errors, assumed.noise, **assumed.of_model)
+    except ValueError as error:
+        raise RejectedError(str(error)) from None
     output, starts = str(entry.get("output")), bool(entry.get("from_start", True))
     counts = {"x": loop.n, "u": loop.B.ncols(), "y": loop.output_rows.nrows()}
     entries = {f"{kind}[{i}]" for kind, count in counts.items() for i in range(count)}
     if output not in {"x", "e_s", "e_c", "drift"} | entries:
         raise RejectedError(f"output: {output[:50]!r} is none of the loop's")
+    if output.startswith("e_") and not model.sees_all:
+        raise RejectedError(
+            f"{output}: the model has no more of errors than the input and the rule depend on"
+        )
     if output == "e_s" and model.is_periodic:
         raise RejectedError("e_s: the model of a periodic rule has no error of an update that is lost")
     matrices, numbers = entry.get("matrices"), entry.get("numbers")
@@ -365,14 +377,14 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
 
 
 def compares_error(loop: Loop) -> bool:
-    """Return whether the rule compares ‖W e_s‖ with a threshold."""
-    return _exceeds_by_error(loop) and not loop.rule.negative.nrows()
+    """Return whether the rule compares ‖W e_s‖ with a threshold at all tests."""
+    return _exceeds_by_error(loop) and not loop.rule.negative.nrows() and not loop.needs_tests_apart
 
 
 def _exceeds_by_error(loop: Loop) -> bool:
     """Return whether the rule compares ‖W e_s‖ with at least its threshold."""
     n, positive = loop.n, loop.rule.positive
-    if positive.nrows() != n:
+    if positive.nrows() != n or loop.rule.of_input:
         return False
     entries = (
         (positive[i, j], loop.weight[i, j - n] if j >= n else 0) for i in range(n) for j in range(2 * n)

@@ -12,11 +12,23 @@ from typing import NamedTuple, Required, TypedDict
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import beside, columns_of, identity, is_zero, matrix, number, rows_of, stack, zeros
+from noack_check.balls import (
+    beside,
+    columns_of,
+    identity,
+    is_positive,
+    is_zero,
+    matrix,
+    number,
+    rows_of,
+    stack,
+    transpose,
+    zeros,
+)
 from noack_check.document import read_table
 from noack_check.equations import LinearPlants, enclose, read_region
 from noack_check.keys import RefusedError, Table, refusals
-from noack_check.loop import Along, Loop, Observer, Region, Rule, Times
+from noack_check.loop import Along, Loop, Memory, Observer, Region, Rule, Times
 from noack_check.times import NS_PER_S, Schedule, fraction, nanoseconds
 
 Rows = Sequence[Sequence[float]]
@@ -67,7 +79,7 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool, enclosed: Enclosed | N
     _choice(_table(resolved, "network"), "network.initial_sync", ("first_packet", "known_state"))
     pushes = [*_disturbances(plant, matrix(plants.B), matrix(plants.half_B)), *_at_rest(plants.A, x_r)]
     weight = _weight(trigger, n)
-    rule = _rule(trigger, weight)
+    rule = _rule(trigger, weight, model)
     loop = Loop(
         A=matrix(plants.A),
         B=matrix(plants.B),
@@ -258,29 +270,101 @@ def _window(constraint: Table) -> tuple[int, int]:
 
 def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
     """Return the times; a rule with a grid is tested at its points, and otherwise at measurements."""
-    plant, zero, due_ns = _table(resolved, "plant"), fmpq(0), _due_ns(trigger)
-    period = fmpq(due_ns, NS_PER_S)
-    times = Times(zero, zero, zero, zero, zero, period, period)
+    plant, zero, due = _table(resolved, "plant"), fmpq(0), _due_ns(trigger)
+    times = Times(zero, zero, zero, zero, zero, *(fmpq(ns, NS_PER_S) for ns in due))
     if not ideal:
         schedule = read_schedule(resolved)
         times = schedule.times
-        if due_ns:
-            least, most = schedule.between_events(due_ns)
-            times = times._replace(least_period=least, period=most)
+        if due[1]:
+            (first, _), (_, last) = (schedule.between_events(ns) for ns in due)
+            times = times._replace(least_period=first, period=last)
         _require_watchdog(_optional_table(plant, "watchdog"), times)
         _require_stated_delay(resolved)
-    inner = trigger
-    while inner.get("policy") == "deadline":
-        inner = _table(inner, "rule")
+    if due[1]:
+        return times
+    outer, inner = _combined(trigger)[:-1], _combined(trigger)[-1]
     if inner.get("policy") == "quadratic":
-        grid_ns = nanoseconds(_real(inner, "trigger.period_s"))
-        if not grid_ns > 0 or Fraction(grid_ns) % read_schedule(resolved).sample:
+        grid_ns = _interval_ns(inner, "trigger.period_s")
+        if Fraction(grid_ns) % read_schedule(resolved).sample:
             raise RefusedError("trigger.period_s: not a multiple of the time between measurements")
         grid = fmpq(grid_ns, NS_PER_S)
         # With a deadline an event may come between two points of the grid.
-        least = grid if inner is trigger else times.least_sampling
+        has_deadline = any(rule.get("policy") == "deadline" for rule in outer)
+        least = times.least_sampling if has_deadline else grid
         times = times._replace(sampling=grid, least_sampling=least)
+    dwell_ns = _intervals(trigger).dwell
+    has_memory = inner.get("policy") == "dynamic"
+    if (dwell_ns or has_memory) and not times.sampling == times.least_sampling > 0:
+        name = "trigger.interval_s" if dwell_ns else f'trigger.policy = "{inner.get("policy")}"'
+        raise RefusedError(f"{name}: not covered without tests that are an exact time apart")
+    if dwell_ns:
+        tests = int((fmpq(dwell_ns, NS_PER_S) / times.sampling).ceil())
+        times = times._replace(dwell=tests * times.sampling)
     return times
+
+
+def _combined(trigger: Table) -> list[Table]:
+    """Return a rule, and the rules that it contains, from the outside to the inside."""
+    found = [trigger]
+    while found[-1].get("policy") in ("deadline", "dwell"):
+        found.append(_table(found[-1], "rule"))
+    return found
+
+
+class _Intervals(NamedTuple):
+    """The times after an event, in ns, that a trigger names."""
+
+    dwell: int = 0
+    """The comparison does not count before this time."""
+    shortest: int = 0
+    longest: int = 0
+    """The next event is due at some time between both, whatever is compared; 0: none is due."""
+
+
+def _intervals(trigger: Table) -> _Intervals:
+    """Return the times that a trigger names; see noack.trigger_policies for what they mean together."""
+    *outer, base = _combined(trigger)
+    found, policy = _Intervals(), base.get("policy")
+    if policy == "periodic":
+        period_ns = _interval_ns(base, "trigger.period_s")
+        found = _Intervals(0, period_ns, period_ns)
+    elif policy == "self_triggered":
+        ends = (_interval_ns(base, f"trigger.{key}_s") for key in ("shortest", "longest"))
+        found = _Intervals(0, *ends)
+    elif policy == "quadratic":
+        heartbeat_ns = _whole(base, "trigger.heartbeat") * _interval_ns(base, "trigger.period_s")
+        found = _Intervals(0, heartbeat_ns, heartbeat_ns)
+    for rule in reversed(outer):
+        interval_ns = _interval_ns(rule, "trigger.interval_s")
+        if rule.get("policy") == "dwell":
+            due = (max(ns, interval_ns) if found.longest else 0 for ns in found[1:])
+            found = _Intervals(max(found.dwell, interval_ns), *due)
+        else:
+            due = (min(ns, interval_ns) if found.longest else interval_ns for ns in found[1:])
+            found = _Intervals(found.dwell, *due)
+    return found
+
+
+def _interval_ns(trigger: Table, name: str) -> int:
+    interval_ns = nanoseconds(_real(trigger, name))
+    if not interval_ns:
+        raise RefusedError(f"{name}: below 1 ns")
+    return interval_ns
+
+
+def _due_ns(trigger: Table) -> tuple[int, int]:
+    """Return after which times the next event of a rule is due that does not depend on a comparison, in ns.
+
+    It is due at some time between both. They are 0 for rules that depend on one. With a deadline, rules of
+    which a comparison says little may have an event at any test up to it.
+    """
+    times, policy = _intervals(trigger), _combined(trigger)[-1].get("policy")
+    if policy in ("periodic", "self_triggered"):
+        return times.shortest, times.longest
+    if times.longest and policy in ("send_on_area", "lyapunov", "dynamic"):
+        return min(max(times.dwell, 1), times.longest), times.longest
+    is_due_first = 0 < times.longest <= times.dwell
+    return (times.longest, times.longest) if is_due_first else (0, 0)
 
 
 def read_schedule(resolved: Table) -> Schedule:
@@ -336,21 +420,6 @@ def loss_windows(resolved: Table) -> Sequence[tuple[int, int]]:
     return found
 
 
-def _due_ns(trigger: Table) -> int:
-    """Return the time after which the next event of a periodic rule is due, in ns; 0 for other rules."""
-    if trigger.get("policy") == "periodic":
-        due_ns = nanoseconds(_real(trigger, "trigger.period_s"))
-        if not due_ns:
-            raise RefusedError("trigger.period_s: below 1 ns")
-        return due_ns
-    if trigger.get("policy") != "deadline":
-        return 0
-    interval_ns = nanoseconds(_real(trigger, "trigger.interval_s"))
-    if not interval_ns:
-        raise RefusedError("trigger.interval_s: below 1 ns")
-    return min(_due_ns(_table(trigger, "rule")), interval_ns)
-
-
 def _require_watchdog(watchdog: Table, times: Times) -> None:
     """Require that the plant's watchdog does not replace inputs as old as they may be."""
     if watchdog.get("policy", "hold") == "hold":
@@ -367,9 +436,8 @@ def _require_watchdog(watchdog: Table, times: Times) -> None:
 
 
 def _weight(trigger: Table, n: int) -> arb_mat:
-    """Return W; that of a rule with a deadline is that of the rule."""
-    if trigger.get("policy") == "deadline":
-        return _weight(_table(trigger, "rule"), n)
+    """Return W; that of a rule that contains another one is that of the inner rule."""
+    trigger = _combined(trigger)[-1]
     if "weight" not in trigger:
         return identity(n)
     rows = _matrix(trigger, "trigger.weight")
@@ -378,8 +446,17 @@ def _weight(trigger: Table, n: int) -> arb_mat:
     return matrix(rows)
 
 
-def _rule(trigger: Table, weight: arb_mat) -> Rule:
-    """Return the rule of a trigger, in which W e_s is compared."""
+def _rule(trigger: Table, weight: arb_mat, model: Table) -> Rule:
+    """Return the rule of a trigger; one whose events do not depend on its comparison has none."""
+    if _due_ns(trigger)[1]:
+        nothing = zeros(0, 2 * weight.nrows())
+        return Rule(nothing, nothing, arb(0), arb(0), arb(0))
+    rule = _compared(_combined(trigger)[-1], weight, model)
+    return rule._replace(always=_intervals(trigger).longest > 0)
+
+
+def _compared(trigger: Table, weight: arb_mat, model: Table) -> Rule:
+    """Return the comparison of a rule, in which W e_s is compared, or a quadratic form."""
     n, policy = weight.nrows(), trigger.get("policy")
     errors, nothing = beside(zeros(n, n), weight), zeros(0, 2 * n)
     rule = Rule(errors, nothing, arb(0), arb(0), arb(0))
@@ -394,33 +471,69 @@ def _rule(trigger: Table, weight: arb_mat) -> Rule:
         states = beside(number(_real(trigger, "trigger.sigma")) * weight, zeros(n, n))
         return rule._replace(negative=states, floor=floor)
     if policy == "quadratic":
-        positive, negative = _squares(_matrix(trigger, "trigger.Q"), 2 * n)
+        Q = _matrix(trigger, "trigger.Q")
+        if len(Q) != 2 * n or len(Q[0]) != 2 * n:
+            raise RefusedError(f"trigger.Q: not {2 * n} x {2 * n}")
+        positive, negative = _squares(matrix(Q))
         floor = number(_real(trigger, "trigger.epsilon")).sqrt()
-        return rule._replace(
-            positive=positive,
-            negative=negative,
-            floor=floor,
-            always=_whole(trigger, "trigger.heartbeat") > 0,
-        )
-    if policy == "periodic":
-        return rule._replace(positive=nothing)
-    if policy == "deadline":
-        rule = _rule(_table(trigger, "rule"), weight)
-        return rule._replace(always=rule.positive.nrows() > 0)
-    raise RefusedError(f"trigger.policy = {policy!r}: not covered")
+        return rule._replace(positive=positive, negative=negative, floor=floor)
+    if policy == "dynamic":
+        return _dynamic(trigger, n, model)
+    end = ": not covered without a deadline" if policy in ("lyapunov", "send_on_area") else ": not covered"
+    raise RefusedError(f"trigger.policy = {policy!r}{end}")
 
 
-def _squares(Q: Rows, size: int) -> tuple[arb_mat, arb_mat]:
-    """Return P and N with ‖Pz‖² − ‖Nz‖² = zᵀQz: 2ab is ((a + b)² − (a − b)²)/2.
+def _dynamic(trigger: Table, n: int, model: Table) -> Rule:
+    """Return Girard's rule: η + θw < 0 with w = σ xᵀQx − 2 xᵀPBK e_s and dη/dt = −λη + w.
+
+    P is that of the model's closed loop F: FᵀP + PF = −Q.
+    """
+    A, B, K = (matrix(_matrix(model, f"model.{key}")) for key in ("A", "B", "gain"))
+    Q = matrix(_matrix(trigger, "trigger.Q")) if "Q" in trigger else identity(n)
+    if (Q.nrows(), Q.ncols()) != (n, n):
+        raise RefusedError(f"trigger.Q: not {n} x {n}")
+    P, keys = _lyapunov_function(A + B * K, Q), ("sigma", "theta_s", "decay_per_s", "eta_0")
+    sigma, theta, decay, start = (number(_real(trigger, f"trigger.{key}")) for key in keys)
+    w = _blocks(sigma * Q, -1 * (P * B))
+    zero = arb(0)
+    return Rule(*_squares(-1 * theta * w), zero, zero, zero, memory=Memory(decay, w, start), of_input=True)
+
+
+def _blocks(first: arb_mat, cross: arb_mat) -> arb_mat:
+    """Return the symmetric matrix of two blocks above, and 0 below on the right; without radii."""
+    whole = stack([beside(first, cross), beside(transpose(cross), zeros(cross.ncols(), cross.ncols()))])
+    return arb_mat(whole.nrows(), whole.ncols(), [entry.mid() for entry in whole.entries()])
+
+
+def _lyapunov_function(F: arb_mat, Q: arb_mat) -> arb_mat:
+    """Return P with FᵀP + PF = −Q, (n, n); noack has the same one up to rounding."""
+    n = F.nrows()
+    every = [(i, j) for i in range(n) for j in range(n)]
+    equations = arb_mat(
+        n * n,
+        n * n,
+        [F[k, i] * (j == m) + F[m, j] * (i == k) for i, j in every for k, m in every],
+    )
+    try:
+        solution = equations.solve(arb_mat(n * n, 1, [-Q[i, j] for i, j in every]))
+    except ZeroDivisionError:
+        raise RefusedError("trigger.policy: no Lyapunov function of model.A and model.gain") from None
+    P = arb_mat(n, n, [(solution[i * n + j, 0] + solution[j * n + i, 0]) / 2 for i, j in every])
+    if not is_positive(P):
+        raise RefusedError("trigger.policy: the closed loop of the model is not stable")
+    return P
+
+
+def _squares(Q: arb_mat) -> tuple[arb_mat, arb_mat]:
+    """Return P and N with ‖Pz‖² − ‖Nz‖² = zᵀQz of a Q without radii: 2ab is ((a + b)² − (a − b)²)/2.
 
     noack reads the lower triangle of Q.
     """
-    if len(Q) != size or len(Q[0]) != size:
-        raise RefusedError(f"trigger.Q: not {size} x {size}")
+    size = Q.nrows()
     P, N = [zeros(0, size)], [zeros(0, size)]
     for i in range(size):
         for j in range(i + 1):
-            value = number(Q[i][j])
+            value = Q[i, j]
             own, others = (P, N) if value > 0 else (N, P)
             first, second = (rows_of(identity(size), [k]) for k in (i, j))
             if i == j and value != 0:

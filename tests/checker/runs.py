@@ -65,7 +65,7 @@ class _Plant:
 def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -> list[Exceeded]:
     """Return where a random run exceeds what is proven."""
     plant, times, rule = _Plant(loop, rng), [float(t.p) / float(t.q) for t in loop.times], loop.rule
-    sampling, least, delay, age, start, *periods = times
+    sampling, least, delay, age, start, *periods, dwell = times
     next_event = rng.choice(periods) if periods[1] else np.inf  # of a periodic rule
     if periods[1] and loop.observer is None:
         least = sampling = periods[1] / _PARTS
@@ -87,8 +87,10 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
             signs = np.where(along == 0, signs, np.sign(along)) * (1 if kind_of_noise == "hides" else -1)
         return np.asarray(x + noise @ signs)
 
+    remembered = _Memory(loop)
     y = measured(x, x, x if loop.observer is None else x + floats(loop.observer.start)[:, 0])
     z = np.concatenate([x, y, y, y, [1.0]])
+    remembered.start(y)
     first_input = start * rng.choice([0.0, 1.0, rng.random()])
     style = rng.integers(3)
     ages = [0.0, age, age / 2]
@@ -124,8 +126,13 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
         if t >= min(next_test, next_event):
             y = z[3 * n : 4 * n] = measured(z[:n], z[n : 2 * n], z[3 * n : 4 * n])
             pair = np.concatenate([y, z[n : 2 * n] - y])
-            threshold = np.hypot(max(level * np.exp(-rate * t), floor), np.linalg.norm(negative @ pair))
-            fires = np.linalg.norm(positive @ pair) > threshold or (rule.always and rng.random() < 0.2)
+            seen = np.concatenate([y, plant.gain @ pair[n:]]) if rule.of_input else pair
+            eta = remembered.at_test(sampling)
+            threshold = np.hypot(max(level * np.exp(-rate * t), floor), np.linalg.norm(negative @ seen))
+            threshold = np.hypot(threshold, np.sqrt(max(eta, 0.0)))
+            fires = np.linalg.norm(positive @ seen) > threshold or (rule.always and rng.random() < 0.2)
+            fires = fires and t - events[-1] > dwell - 1e-9
+            remembered.test(seen)
             if periods[1]:
                 fires = t >= next_event
             if fires:
@@ -147,6 +154,31 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
             if rng.random() < 0.05:
                 signs = tuple(rng.choice([-1.0, 1.0], len(loop.sizes)))
     return found
+
+
+class _Memory:
+    """η of a rule, which it integrates as the core does: with its rate at the test before."""
+
+    def __init__(self, loop: Loop) -> None:
+        self._memory, self._eta, self._rate = loop.rule.memory, 0.0, 0.0
+        if self._memory is not None:
+            self._decay, self._gain = float(self._memory.decay.mid()), floats(self._memory.gain)
+            self._n = loop.n
+
+    def start(self, y: Array) -> None:
+        if self._memory is not None:
+            self._eta = float(self._memory.start.mid())
+            self.test(np.concatenate([y, np.zeros(len(self._gain) - self._n)]))
+
+    def at_test(self, step_s: float) -> float:
+        if self._memory is not None:
+            gained_s = -np.expm1(-self._decay * step_s) / self._decay if self._decay else step_s
+            self._eta = self._eta * np.exp(-self._decay * step_s) + gained_s * self._rate
+        return self._eta
+
+    def test(self, seen: Array) -> None:
+        if self._memory is not None:
+            self._rate = float(seen @ self._gain @ seen)
 
 
 def _apart(found: list[Exceeded], proof: Proof, events: list[float], t: float, first_input: float) -> None:

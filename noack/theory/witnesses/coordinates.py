@@ -17,6 +17,8 @@ from noack_check.model import Model
 
 Frames = Mapping[str, Matrix]
 """By the name of a witness's matrix V: T with V = T⁻ᵀ V̂ T⁻¹, V̂ of order 1."""
+MEMORY = "y"
+"""The name of the unit of a rule's memory."""
 _RUNS, _MOST_STEPS = 120, 3000
 _STEPS = 16
 """At least, of the period of a periodic rule."""
@@ -36,12 +38,14 @@ def simulated_frames(model: Model) -> Frames:
     runs.advance()
     frames: dict[str, Matrix] = {}
     for index, place in enumerate(model.locations):
-        own = runs.moments(place.name)
+        own = runs.moments(place.name.partition(", ")[0])
         for node in range(len(place.nodes)):
             for name, S in model.form(index, node).parts:
                 where = [place.coordinates[int(np.flatnonzero(row)[0])] for row in floats(S)]
                 block = (runs.moments("") if name.startswith("X") else own)[np.ix_(where, where)]
                 frames[name] = 2 * _root(block + 0.3 * np.diag(np.diag(block)))
+    if model.memory is not None:
+        frames[MEMORY] = 2 * np.sqrt(runs.moments("")[np.ix_(runs.memory, runs.memory)])
     return frames
 
 
@@ -88,9 +92,18 @@ class _Runs:
         half = _RUNS // 2
         self._z[half:, :moving] = spread * self._rng.standard_normal((_RUNS - half, moving)) / np.sqrt(moving)
         W, threshold = floats(self._loop.weight), float(np.sqrt(self._unit.sum()))
-        if np.linalg.norm(W @ flows[0][n : 2 * n, :n]) * spread < _SLOW * slowest * threshold:
+        if (
+            model.sees_all
+            and np.linalg.norm(W @ flows[0][n : 2 * n, :n]) * spread < _SLOW * slowest * threshold
+        ):
             errors = self._rng.standard_normal((_RUNS - half, n)) @ np.linalg.inv(W).T
             self._z[half:, n : 2 * n] = threshold / np.sqrt(n) * errors
+        self.memory = np.flatnonzero(floats(model.y).any(axis=0))
+        """The place of y in z, if there is one."""
+        self._remembered = floats(model.memory_after_test())
+        self._z[:, self.memory] = model.memory_at_start
+        self._z[:, self.memory] = self._next_memory()
+        self._since_event, self._dwell = np.zeros(_RUNS), _seconds(self._loop.times.dwell)
         self._missing = np.zeros(_RUNS, int)
         self._later, self._most = np.zeros(_RUNS, int), model.later
         self._waiting = np.zeros(_RUNS, bool)
@@ -114,7 +127,10 @@ class _Runs:
         for step in range(self._steps):
             self._flow(step)
             self._z[:, self._noise] = self._rng.choice([-1.0, 1.0], (_RUNS, len(self._noise)))
-            self._jump(self._events(step))
+            event = self._events(step)
+            remembered = self._next_memory()
+            self._jump(event)
+            self._z[:, self.memory] = remembered
             self._observe()
 
     def moments(self, location: str) -> Matrix:
@@ -137,7 +153,14 @@ class _Runs:
     def _events(self, step: int) -> NDArray[np.bool_]:
         if self._period_s:
             return np.full(_RUNS, (step + 1) % round(self._period_s / self._h) == 0)
-        return self._quadratic(self._silent) > 0
+        self._since_event += self._h
+        event = (self._quadratic(self._silent) > 0) & (self._since_event > self._dwell - self._h / 2)
+        self._since_event[event] = 0
+        return event
+
+    def _next_memory(self) -> Matrix:
+        """Return y of all runs after tests, (_RUNS, 1)."""
+        return np.sqrt(np.maximum(self._quadratic(self._remembered), 0.0))[:, None]
 
     def _jump(self, event: NDArray[np.bool_]) -> None:
         z, delay_s = self._z, _seconds(self._loop.times.delay)

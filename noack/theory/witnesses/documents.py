@@ -19,7 +19,7 @@ from noack.theory.witnesses.assumptions import (
 from noack.theory.witnesses.coordinates import floats, simulated_frames
 from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
 from noack.theory.witnesses.line_search import search_lowest
-from noack.theory.witnesses.search import Found, Search, refined
+from noack.theory.witnesses.search import FREE, Found, Search, refined
 from noack.theory.witnesses.semidefinite import Accuracy
 from noack.theory.witnesses.templates import Templates
 from noack_check.balls import number
@@ -37,14 +37,19 @@ _ATTEMPTS = (
     ),
 )
 """Margins of the inequalities, in the coordinates of the search, until the checker accepts."""
+_ATTEMPTS_BY_TESTS = (
+    *((margin, Accuracy(gap=1e-4, feasibility=1e-8, improves_steps=True)) for margin in (1e-8, 1e-7, 1e-6)),
+    _ATTEMPTS[0],
+)
+"""Those of forms of each test, in which V changes little from test to test."""
 _COARSE_MARGIN = 1e-6
 _FIRST_SHARE, _FIRST_SLOW_SHARE, _FIRST_CLOCK_SHARE = 0.42, 0.04, 0.02
 """ν is between 2r and twice the loop's rate of decay, at a share."""
 _MOST_TRIES, _FEW_TRIES, _LARGE = 5, 2, 1.0
 """Shares that are tried for an output, also for a problem that is large: its work is above a limit."""
 _ROOM, _NEAR = 1 + 1e-6, 1.04
-_PIECES = (4, 16)
-"""Of the period of a periodic rule, until there is a witness."""
+_PIECES, _PIECES_OF_TESTS = (4, 16), (1, 4, 32)
+"""Of the period of a periodic rule, or of the time between two tests, until there is a witness."""
 _MOST_LOSSES = 24
 _MOST_GUESSES = 6
 _EXPECTED = 5
@@ -89,12 +94,17 @@ def find_witness(
     effort = Effort(progress, most_work)
     effort.expect(_EXPECTED * (1 + len(outputs) + len(ultimate)))
     wanted = _Wanted(outputs, ultimate, near)
-    if loop.times.period > 0:
+    if loop.times.period > 0 or loop.needs_tests_apart:
         return _by_clock(loop, wanted, effort)
     if not compares_error(loop):
+        for slow in (None, 0.01):
+            try:
+                return _by_quadratic_forms(loop, _Rates(loop, slow=slow), wanted, effort)
+            except NoWitnessError as error:
+                reason = error
         with contextlib.suppress(NoWitnessError):
-            return _by_quadratic_forms(loop, rates, wanted, effort)
-        return _by_quadratic_forms(loop, _Rates(loop, slow=0.01), wanted, effort)
+            return _by_clock(loop, wanted, effort)
+        raise reason
     try:
         return _by_threshold(loop, rates, wanted, effort)
     except WorkLimitError:
@@ -172,23 +182,30 @@ def _by_quadratic_forms(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Ef
 
 
 def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort) -> Witness:
-    """Return a witness for a periodic rule, with the fewest parts of its period for which there is one.
+    """Return a witness by forms at nodes of clocks, with the fewest pieces for which there is one.
 
-    Without forms for a small ν there are none for larger ones, and no bound decays faster than that of a
-    similar loop.
+    The clocks count from events of a periodic rule, or from tests that are an exact time apart. Without
+    forms for a small ν there are none for larger ones, and no bound decays faster than one of a similar loop.
     """
+    by_tests = not loop.times.period > 0
+    if loop.rule.memory is not None and loop.losses:
+        raise NoWitnessError("with losses quadratic forms are not known for a rule with a dynamic variable")
     fastest = min((each["rate"] for each in wanted.near if isinstance(each["rate"], float)), default=math.inf)
-    for pieces in _PIECES:
-        for rates in (_Rates(loop, slow=share) for share in (0.3, 0.02)):
+    for pieces in _PIECES_OF_TESTS if by_tests else _PIECES:
+        for rates in (_Rates(loop, slow=share, by_tests=by_tests) for share in (0.3, 0.02)):
             if rates.rate > fastest:
                 continue
             rates.first_share, rates.moves = _FIRST_CLOCK_SHARE, (0,)
             document = {**first_assumptions(loop, rates.rate), "pieces": pieces}
+            if by_tests:
+                document["by_tests"] = True
             effort.expect(_EXPECTED)
             search = _OutputSearch(loop, rates, document, rates.shares(wanted.near), effort)
-            if not search.has_solution(wanted.outputs[0]):
+            has_errors = not by_tests or loop.seen is None
+            outputs = [output for output in wanted.outputs if has_errors or not output.startswith("e_")]
+            if not outputs or not search.has_solution(outputs[0]):
                 continue
-            bounds = search.bounds(wanted)
+            bounds = search.bounds(wanted._replace(outputs=outputs))
             if bounds:
                 return search.witness(document, bounds)
     raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
@@ -204,17 +221,19 @@ class _Rates:
     ``slow`` is r, without a threshold that decays, as a share of the latter; then ν is small, too.
     """
 
-    def __init__(self, loop: Loop, *, slow: float | None = None) -> None:
+    def __init__(self, loop: Loop, *, slow: float | None = None, by_tests: bool = False) -> None:
         moving = loop.n - loop.loads
         closed = floats(loop.A + loop.B * loop.gain)
         own = [M[:moving, :moving] for M in ([closed] if loop.holds else [closed, floats(loop.H)])]
         self.slowest = min(-float(np.linalg.eigvals(M).real.max()) for M in own)
         self.slowest = min(self.slowest, observer_decay(loop))
+        if loop.rule.memory is not None:
+            self.slowest = min(self.slowest, float(loop.rule.memory.decay) / 2)
         threshold, level = float(loop.rule.rate), float(loop.rule.level)
         wanted = threshold if level else (slow or 0.3) * self.slowest
         self.first_share = _FIRST_SLOW_SHARE if slow else _FIRST_SHARE
         self.moves: Sequence[int] = (0, -1, 1, -2, 2)
-        if loop.holds or (level and not threshold):
+        if (loop.holds and not by_tests) or (level and not threshold):
             self.rate = 0.0
         else:
             self.rate = wanted if wanted < 0.95 * self.slowest else 0.8 * self.slowest
@@ -271,9 +290,9 @@ class _OutputSearch:
         require_few(document)
         try:
             self._assumed = read_assumptions(loop, self._rate, document)
-        except RejectedError as error:
+            self._templates = Templates(self._model)
+        except ValueError as error:
             raise NoWitnessError(str(error)) from None
-        self._templates = Templates(self._model)
         self._frames = simulated_frames(self._templates.model)
         self._search = Search(self._templates, self._frames)
         self._best: dict[tuple[str, bool], tuple[float, Found]] = {}
@@ -299,9 +318,7 @@ class _OutputSearch:
             number(decay),
             assumed.errors,
             assumed.noise,
-            later=assumed.later,
-            later_at_start=assumed.later_at_start,
-            pieces=assumed.pieces,
+            **assumed.of_model,
             is_exact=False,
         )
 
@@ -346,7 +363,8 @@ class _OutputSearch:
 
         With each comes whether more will not give a smaller bound.
         """
-        search, attempts = self._search, list(enumerate(_ATTEMPTS))
+        by_tests = self._assumed.by_tests
+        search, attempts = self._search, list(enumerate(_ATTEMPTS_BY_TESTS if by_tests else _ATTEMPTS))
         if self._is_direct(output, starts=starts):  # the coarse one is as accurate
             yield False, coarse
             search = Search(self._templates, refined(search.frames, coarse))
@@ -432,7 +450,7 @@ def _entry(output: str, decay: float, found: Found, *, starts: bool) -> dict[str
     """Return the entry of a document: symmetric matrices, multipliers that are not negative."""
     numbers = {
         name: value
-        if name.startswith("c")
+        if name.startswith(FREE)
         else max(value, 0.0) * (_ROOM if name.startswith("level") else 1.0)
         for name, value in found.numbers.items()
     }

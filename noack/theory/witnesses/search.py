@@ -10,12 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix
-from noack.theory.witnesses.coordinates import Frames, floats
+from noack.theory.witnesses.coordinates import MEMORY, Frames, floats
 from noack.theory.witnesses.semidefinite import Accuracy, MatrixInequality, SolverAnswer, minimise
 from noack.theory.witnesses.templates import Template, Templates
 
 _CONSTANT_WEIGHT = 100.0
 """Of D₂² of an output."""
+FREE = ("c", "eta")
+"""Numbers with such names may be negative."""
 
 
 class Found(NamedTuple):
@@ -66,7 +68,7 @@ class Search:
         objective = {name: weight * units[name] for name, weight in weights.items() if name in units}
         largest = max(objective.values())
         objective = {name: w / largest for name, w in objective.items()}
-        free = {name for name in units if name.startswith("c")}
+        free = {name for name in units if name.startswith(FREE)}
         solution = minimise(objective, problem, free=free, margin=margin, accuracy=accuracy)
         if not solution.is_solved:
             return None
@@ -100,6 +102,9 @@ class Search:
             if row in place.coordinates:
                 at = place.coordinates.index(row)
                 frame[at, at] = self._f_units[f]
+        if (memory := floats(self.model.y)).any():
+            at = place.coordinates.index(int(np.flatnonzero(memory[0])[0]))
+            frame[at, at] = self.frames[MEMORY][0, 0]
         for name, S in form.parts:
             where = [int(np.flatnonzero(row)[0]) for row in floats(S)]
             frame[np.ix_(where, where)] = self.frames[name]
@@ -111,6 +116,9 @@ class Search:
             for name, left, right in item.parts
         )
         result = MatrixInequality(parts, item.scalars, item.constant / size**2)
+        if self.model.is_by_tests and parts:  # some consist of small differences only
+            largest = max(float(np.abs(left).max() * np.abs(right).max()) for _, left, right in parts)
+            result = result.scaled(1 / largest)
         frame = np.eye(1) if item.signals < 0 else self._whole[item.location]
         whole, first = np.eye(len(item.constant)), len(frame)
         whole[:first, :first] = frame

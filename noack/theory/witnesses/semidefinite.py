@@ -46,6 +46,14 @@ class MatrixInequality(NamedTuple):
             frame.T @ self.constant @ frame,
         )
 
+    def scaled(self, factor: float) -> "MatrixInequality":
+        """Return factor · (·)."""
+        return MatrixInequality(
+            tuple((name, factor * left, right) for name, left, right in self.parts),
+            tuple((name, factor * M) for name, M in self.scalars),
+            factor * self.constant,
+        )
+
 
 class SolverAnswer(NamedTuple):
     """What the solver found; ``status`` is its own word."""

@@ -1,0 +1,420 @@
+"""Rules whose tests are an exact time apart: dwell times, dynamic variables, grids; false witnesses, runs."""
+
+import copy
+import functools
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb, fmpq
+from scipy.linalg import solve_continuous_lyapunov
+
+from noack.theory.witnesses.documents import Witness, find_witness
+from noack_check.balls import beside, identity, matrix, number, zeros
+from noack_check.check import RejectedError
+from noack_check.keys import RefusedError
+from noack_check.loop import Loop, Times
+from noack_check.model import Model
+from noack_check.proof import prove
+from noack_check.scenario import read_loop
+from noack_check.tests_apart import Place, Places
+from tests.checker.runs import exceeded, floats
+from tests.checker.test_mutations import DOCUMENTS
+from tests.checker.test_mutations import LOOPS as OTHER_LOOPS
+from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
+from tests.helpers.resolved_tables import resolved_tables
+from tests.oracles.trigger_rules import Trigger
+
+T = fmpq(1, 100)
+DYNAMIC = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5, "eta_0": 0.1}
+
+
+def toml(trigger: dict[str, Any]) -> str:
+    """Return the setting of a trigger."""
+    text = json.dumps(trigger).replace('": ', '" = ')
+    return f"trigger={text}"
+
+
+def read(name: str, trigger: dict[str, Any] | None = None, *settings: str, ideal: bool = False) -> Loop:
+    given = [] if trigger is None else [toml(trigger)]
+    return read_loop(resolved_tables(name, *given, *settings), box=False, ideal=ideal)
+
+
+def dwelling(times: Times = SCHEDULE) -> Loop:
+    """Return a double integrator that waits for five tests after an event."""
+    loop = double_integrator(times, floor=0.02)
+    return loop._replace(times=loop.times._replace(dwell=5 * loop.times.sampling), losses=1)
+
+
+def dynamic() -> Loop:
+    """Return a loop with Girard's rule, without losses and delays, tested every 20 ms."""
+    loop, zero = read("double_integrator", DYNAMIC, "network.mansd=0"), fmpq(0)
+    step = fmpq(1, 50)
+    return loop._replace(
+        times=loop.times._replace(delay=zero, age=zero, start=zero, sampling=step, least_sampling=step)
+    )
+
+
+LOOPS: dict[str, Callable[[], Loop]] = {
+    "dwell": dwelling,
+    "dynamic": dynamic,
+    "switching": lambda: read("selivanov_switching"),
+    "grid": lambda: read("reactor_petc", ideal=True),
+}
+
+
+@functools.cache
+def base(name: str) -> tuple[Loop, Witness]:
+    loop = LOOPS[name]()
+    return loop, find_witness(loop, ("x", "e_c"))
+
+
+def bound_of(witness: Witness, output: str = "x") -> float:
+    bound = next(bound for bound in witness.proof.bounds if bound.output == output)
+    return float(bound.decaying.mid()) + float(bound.constant.mid())
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_runs_stay_below_the_bounds(name: str) -> None:
+    loop, witness = base(name)
+    rng = np.random.default_rng(1)
+    for _ in range(8):
+        assert exceeded(loop, witness.proof, rng, 4.0) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "share"), [("dwell", 0.8), ("dynamic", 0.6), ("switching", 0.97), ("grid", 0.5)]
+)
+def test_runs_come_near_the_bounds(name: str, share: float) -> None:
+    loop, witness = base(name)
+    rng = np.random.default_rng(1)
+    bounds = tuple(
+        b._replace(decaying=b.decaying * number(share), constant=b.constant * number(share))
+        for b in witness.proof.bounds
+        if b.output == "x"
+    )
+    smaller = witness.proof._replace(bounds=bounds)
+    assert any(exceeded(loop, smaller, rng, 4.0) for _ in range(6))
+
+
+@pytest.mark.parametrize("name", ["double_integrator", "unstable_pendulum"])
+def test_the_memory_is_that_of_the_reference(name: str) -> None:
+    """Sides of the comparison at random measurements, some of which are events."""
+    loop, rng = read(name, DYNAMIC), np.random.default_rng(2)
+    K, memory, step_s = floats(loop.gain), loop.rule.memory, 0.01
+    assert memory is not None
+    BK = floats(loop.model_B) @ K
+    reference = Trigger(DYNAMIC, floats(loop.model_A) + BK, BK)
+    P, N, gain = floats(loop.rule.positive), floats(loop.rule.negative), floats(memory.gain)
+    decay, eta, rate, t_ns = float(memory.decay), float(memory.start), 0.0, 0
+    for step in range(12):
+        x, e = rng.normal(size=(2, 2)) if step else (rng.normal(size=2), np.zeros(2))
+        seen = np.concatenate([x, K @ e])
+        gained_s = -np.expm1(-decay * step_s) / decay
+        if step:
+            t_ns += 10_000_000
+            eta = np.exp(-decay * step_s) * eta + gained_s * rate
+        reference.measured(t_ns, x, e)
+        if step:
+            left, right = reference.sides(t_ns, x, e)
+            difference = np.sum((P @ seen) ** 2) - np.sum((N @ seen) ** 2) - max(eta, 0.0)
+            assert difference == pytest.approx(left**2 - right**2, rel=1e-9, abs=1e-9)
+        rate = float(seen @ gain @ seen)
+        if step % 3 == 0:
+            reference.event(t_ns, x)
+
+
+def test_the_lyapunov_function_is_that_of_scipy() -> None:
+    loop = read("unstable_pendulum", DYNAMIC)
+    B, K = floats(loop.model_B), floats(loop.gain)
+    F = floats(loop.model_A) + B @ K
+    assert loop.rule.memory is not None
+    gain = floats(loop.rule.memory.gain)
+    assert gain[:2, :2] == pytest.approx(0.5 * np.eye(2))
+    assert gain[:2, 2:] == pytest.approx(-solve_continuous_lyapunov(F.T, -np.eye(2)) @ B, rel=1e-9)
+
+
+# Where updates are at the tests.
+
+
+def places(times: Times, losses: int = 1, later: int = 2, at_start: int = 2) -> Places:
+    return Places(losses, times, later, at_start)
+
+
+def test_an_update_acts_before_its_delay() -> None:
+    """Tests every 10 ms, a delay of 25 ms: its age at a test is 0, 10 or 20 ms."""
+    times = Times(T, T, fmpq(1, 40), fmpq(0), fmpq(0))
+    found = places(times)
+    ages = {place.ages for place in found.places if place.ages}
+    zero, one, two = 0 * T, T, 2 * T
+    assert ages == {(zero,), (one,), (two,), (one, zero), (two, zero), (two, one), (two, one, zero)}
+    for place in found.places:
+        nodes = found.nodes(place, 1)
+        assert nodes[-1] == (T if place.ages[:1] != (two,) else fmpq(1, 200))
+    tests = {move.source for move in found.moves if move.kind != "arrival"}
+    assert not any(place.ages[:1] == (two,) for place in tests)
+
+
+def test_the_update_that_acts_next_is_any_of_those_on_their_way() -> None:
+    found = places(Times(T, T, fmpq(1, 40), fmpq(0), fmpq(0)))
+    source = Place(0, (2 * T, T, 0 * T))
+    targets = {move.target for move in found.moves if move.source == source and move.kind == "arrival"}
+    assert targets == {Place(0, (T, 0 * T)), Place(0, (0 * T,))}  # two lost ones would be too many
+    two = places(Times(T, T, fmpq(1, 40), fmpq(0), fmpq(0)), losses=2)
+    targets = {move.target for move in two.moves if move.source == source and move.kind == "arrival"}
+    assert Place(2, ()) in targets
+
+
+def test_a_dwell_time_has_no_test_that_counts() -> None:
+    loop = dwelling()
+    found = places(loop.times, later=0, at_start=0)
+    for move in found.moves:
+        if move.is_event:
+            assert move.target.dwells
+            assert found.clock_end(move.target) == 5 * T
+        elif move.kind == "silent":
+            assert found.clock_end(move.target) == T
+    assert {place.ages for place in found.places if place.has_input} == {(), (0 * T,)}
+
+
+def test_too_many_places_are_rejected() -> None:
+    loop = dynamic()._replace(times=Times(T, T, fmpq(1, 5), fmpq(0), fmpq(0)))
+    with pytest.raises(RejectedError, match="ways in which updates"):
+        prove(loop, {"rate": 0.0, "later": 8, "bounds": [{"output": "x", "decay": 1.0}]})
+
+
+def test_each_way_to_the_next_memory_has_an_edge() -> None:
+    """η becomes what it has decayed to and gained, or 0."""
+    model, rng = Model(dynamic(), arb(0), arb(1)), np.random.default_rng(0)
+    memory = model.memory
+    assert memory is not None
+    tests = [edge for edge in model.edges if edge.is_test]
+    assert len(tests) == 4
+    y = int(np.flatnonzero(floats(model.y)[0])[0])
+    for edge in tests:
+        assert edge.memory is not None
+        z = rng.normal(size=model.size)
+        x, seen = floats(model.x) @ z, floats(model.loop.gain) @ floats(model.e) @ z
+        pair = np.concatenate([x, seen])
+        step_s, decay = 0.02, float(memory.decay)
+        gained = -np.expm1(-decay * step_s) / decay * pair @ floats(memory.gain) @ pair
+        expected = 0.0 if edge.name.endswith("none") else np.exp(-decay * step_s) * z[y] ** 2 + gained
+        assert z @ floats(edge.memory) @ z == pytest.approx(expected)
+
+
+# False witnesses.
+
+
+CHANGES: dict[str, Callable[[Loop], Loop]] = {
+    "one loss more": lambda loop: loop._replace(losses=loop.losses + 1),
+    "larger start": lambda loop: loop._replace(start=loop.start * number(1.02)),
+    "another plant": lambda loop: loop._replace(B=loop.B * number(0.2)),
+    "a disturbance": lambda loop: loop._replace(pushes=arb_column(loop.n), sizes=(arb(0.05),)),
+    "tests twice as far apart": lambda loop: loop._replace(
+        times=loop.times._replace(sampling=2 * loop.times.sampling, least_sampling=2 * loop.times.sampling)
+    ),
+}
+
+
+def arb_column(n: int) -> Any:
+    return matrix([[1.0]] * n)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_witness_proves_nothing_about_another_loop(name: str, change: str) -> None:
+    loop, witness = base(name)
+    with pytest.raises(RejectedError):
+        prove(CHANGES[change](loop), witness.document)
+
+
+def test_a_longer_dwell_time_and_another_memory_are_rejected() -> None:
+    loop, witness = base("dwell")
+    longer = loop._replace(times=loop.times._replace(dwell=8 * T))
+    with pytest.raises(RejectedError):
+        prove(longer, witness.document)
+    loop, witness = base("dynamic")
+    memory = loop.rule.memory
+    assert memory is not None
+    for other in (
+        memory._replace(gain=memory.gain * 2),
+        memory._replace(start=arb(9)),
+        memory._replace(decay=arb(0)),
+    ):
+        with pytest.raises(RejectedError):
+            prove(loop._replace(rule=loop.rule._replace(memory=other)), witness.document)
+
+
+def test_a_negative_coefficient_of_the_memory_is_rejected() -> None:
+    """η is bounded from above only, so V may not fall with it."""
+    loop, witness = base("dynamic")
+    document: Any = copy.deepcopy(dict(witness.document))
+    numbers = document["bounds"][0]["numbers"]
+    for name in numbers:
+        if name.startswith("eta/"):
+            numbers[name] = -abs(numbers[name])
+    with pytest.raises(RejectedError):
+        prove(loop, document)
+
+
+def test_no_form_may_be_missing() -> None:
+    loop, witness = base("dwell")
+    for name in witness.document["bounds"][0]["matrices"]:  # type: ignore[index]
+        document: Any = copy.deepcopy(dict(witness.document))
+        del document["bounds"][0]["matrices"][name]
+        with pytest.raises(RejectedError, match="missing"):
+            prove(loop, document)
+
+
+def test_the_error_has_no_bound_where_the_model_has_only_its_input() -> None:
+    loop, witness = base("switching")
+    document: Any = copy.deepcopy(dict(witness.document))
+    document["bounds"][0]["output"] = "e_s"
+    with pytest.raises(RejectedError, match="e_s"):
+        prove(loop, document)
+
+
+def test_the_drift_bounds_no_error_during_a_dwell_time() -> None:
+    loop, witness = base("dwell")
+    document: Any = copy.deepcopy(dict(witness.document))
+    document["bounds"][0]["output"] = "drift"
+    with pytest.raises(RejectedError):
+        prove(loop, document)
+    with pytest.raises(RejectedError, match="errors"):
+        prove(loop, {**witness.document, "errors": {"decaying": 1.0, "constant": 1.0}})
+
+
+WRONG: dict[str, Callable[[Loop], Loop]] = {
+    "no tests": lambda loop: loop._replace(times=IDEAL._replace(dwell=fmpq(1))),
+    "tests at unknown times": lambda loop: loop._replace(times=loop.times._replace(least_sampling=T / 4)),
+    "a dwell time before the next test": lambda loop: loop._replace(times=loop.times._replace(dwell=T / 4)),
+    "a memory that begins below 0": lambda loop: with_memory(loop, start=arb(-1)),
+    "a memory that gains below 0": lambda loop: with_memory(loop, gain=identity(3) * -1),
+    "a memory of another size": lambda loop: with_memory(loop, gain=identity(5)),
+    "a memory that gains while no test counts": lambda loop: loop._replace(
+        times=loop.times._replace(dwell=5 * T)
+    ),
+}
+
+
+def with_memory(loop: Loop, **changed: Any) -> Loop:
+    assert loop.rule.memory is not None
+    return loop._replace(rule=loop.rule._replace(memory=loop.rule.memory._replace(**changed)))
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_loop_that_is_none_is_rejected(name: str) -> None:
+    loop = dynamic()
+    loop = loop._replace(times=loop.times._replace(sampling=T, least_sampling=T))
+    assert loop.fault() == ""
+    with pytest.raises(RejectedError, match=r"^loop: "):
+        prove(WRONG[name](loop), {"rate": 0.0, "bounds": []})
+
+
+def test_forms_of_each_test_need_tests_at_exact_times() -> None:
+    loop = double_integrator(SCHEDULE._replace(least_sampling=T / 4))
+    with pytest.raises(RejectedError, match="by_tests"):
+        prove(loop, {"rate": 0.0, "by_tests": True, "bounds": []})
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("change", [*DOCUMENTS, *OTHER_LOOPS])
+def test_what_is_accepted_of_changed_witnesses_is_true(name: str, change: str) -> None:
+    """Random runs stay within what was accepted."""
+    loop, witness = base(name)
+    for seed in range(2):
+        rng, document = np.random.default_rng(seed), copy.deepcopy(dict(witness.document))
+        changed = OTHER_LOOPS[change](loop, rng) if change in OTHER_LOOPS else loop
+        if change in DOCUMENTS:
+            if change == "outputs swapped" and len(document["bounds"]) < 2:  # type: ignore[arg-type]
+                continue
+            DOCUMENTS[change](document, rng)
+        try:
+            proof = prove(changed, document)
+        except RejectedError:
+            continue
+        for _ in range(2):
+            assert exceeded(changed, proof, rng, 3.0) == []
+
+
+# From scenarios.
+
+
+def test_times_of_combined_rules() -> None:
+    """Tests are every 2 ms: a dwell time ends at the first one from it on."""
+    absolute = {"policy": "absolute", "delta": 0.1}
+    loop = read("double_integrator", {"policy": "dwell", "interval_s": 0.0991, "rule": absolute})
+    assert loop.times.dwell == fmpq(1, 10)
+    assert not loop.rule.always
+    within = {
+        "policy": "dwell",
+        "interval_s": 0.3,
+        "rule": {"policy": "deadline", "interval_s": 1.0, "rule": absolute},
+    }
+    loop = read("double_integrator", within)
+    assert loop.rule.always
+    assert loop.times.dwell == fmpq(3, 10)
+
+
+DUE = {
+    "self-triggered": (
+        {"policy": "self_triggered", "beta": 0.3, "alpha_per_s": 0.5, "growth_per_s": 1.0,
+         "mismatch_per_s": 1.0, "shortest_s": 0.01, "longest_s": 0.2},
+        fmpq(1, 100), fmpq(1, 5),
+    ),
+    "area with a deadline": (
+        {"policy": "deadline", "interval_s": 0.1, "rule": {"policy": "send_on_area", "delta_s": 0.1}},
+        fmpq(1, 500), fmpq(1, 10),
+    ),
+    "a deadline before the dwell time ends": (
+        {"policy": "deadline", "interval_s": 0.1,
+         "rule": {"policy": "dwell", "interval_s": 0.3, "rule": {"policy": "absolute", "delta": 0.1}}},
+        fmpq(1, 10), fmpq(1, 10),
+    ),
+    "a dwell time of a period": (
+        {"policy": "dwell", "interval_s": 0.3, "rule": {"policy": "periodic", "period_s": 0.1}},
+        fmpq(3, 10), fmpq(3, 10),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DUE)
+def test_rules_whose_events_do_not_depend_on_a_comparison(name: str) -> None:
+    trigger, least, most = DUE[name]
+    loop = read("double_integrator", trigger)
+    assert (loop.times.least_period, loop.times.period) == (least, most)
+    assert loop.rule.positive.nrows() == 0
+    assert loop.fault() == ""
+
+
+@pytest.mark.parametrize(
+    ("trigger", "ideal", "key"),
+    [
+        (
+            {"policy": "dwell", "interval_s": 0.1, "rule": {"policy": "absolute", "delta": 0.1}},
+            True,
+            "trigger.interval_s",
+        ),
+        (DYNAMIC, True, "trigger.policy"),
+        ({"policy": "send_on_area", "delta_s": 0.1}, False, "trigger.policy"),
+        ({"policy": "lyapunov", "rate_per_s": 0.3}, False, "trigger.policy"),
+    ],
+)
+def test_what_needs_tests_at_times_is_refused_without(trigger: dict[str, Any], ideal: bool, key: str) -> None:
+    with pytest.raises(RefusedError, match=key):
+        read("double_integrator", trigger, ideal=ideal)
+
+
+def test_a_quadratic_rule_of_one_output_needs_no_other_errors() -> None:
+    assert floats(base("switching")[0].seen).tolist() == [[1.0, 0.0]]
+    assert base("grid")[0].seen is None
+    loop = dynamic()._replace(holds=True)
+    assert floats(loop.seen).tolist() == floats(loop.gain).tolist()
+    rule = dwelling().rule
+    assert (
+        dwelling()._replace(holds=True, rule=rule._replace(positive=beside(zeros(2, 2), identity(2)))).seen
+        is None
+    )
