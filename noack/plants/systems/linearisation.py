@@ -3,7 +3,8 @@
 If a system has a derivative (:meth:`OdeSystem.rates`), A and B are its differences: central
 differences over steps from 0.1 to 4e-7 times the size of the component, extrapolated to the order
 4. For each entry the step is used at which the result changes least; an entry that is not larger
-than that change becomes 0.
+than that change becomes 0. Where f jumps at the point, as friction does at standstill, the entry is the
+mean of the slopes on both sides: the jump is left out.
 
 Other systems are only moved: n + m small deviations of x and u are applied, each with both signs. x
 is taken at the beginning, and a step later. Central differences give x(t + h) = Ad x(t) + Bd u; the
@@ -105,15 +106,29 @@ def _differences(f: Callable[[Vector], Vector], point: Vector) -> Matrix:
             off[i] = step
             slopes.append((f(point + off) - f(point - off)) / (2 * step))
         second = np.array(slopes)
-        fourth = (_FINER**2 * second[1:] - second[:-1]) / (_FINER**2 - 1)
-        changes = np.abs(np.diff(fourth, axis=0))
-        changes[~np.isfinite(changes)] = np.inf
-        best = changes.argmin(axis=0)
-        places = np.arange(len(size))
-        column, change = fourth[best + 1, places], changes[best, places]
-        noise = np.maximum(_NOISE * change, _ROUNDING * (size + np.abs(column).max()))
-        columns.append(np.where(np.abs(column) <= noise, 0.0, _rounded(column)))
+        column = _steadiest((_FINER**2 * second[1:] - second[:-1]) / (_FINER**2 - 1), size)
+        rises = second * steps[:, None]  # half of f(+h) - f(-h): J + s h with a jump J
+        jumps = np.abs(rises[-1]) > 0.5 * np.abs(rises[-2])
+        if jumps.any():
+            beside = _steadiest(np.diff(rises, axis=0) / np.diff(steps)[:, None], size)
+            column = np.where(jumps, beside, column)
+        columns.append(column)
     return np.array(columns).T
+
+
+def _steadiest(slopes: Matrix, size: Vector) -> Vector:
+    """Return of each column the slope that changes least from step to step; 0 if it is not larger than that.
+
+    Args:
+        slopes: for each of k steps, (k, n).
+        size: of what f returns, (n,).
+    """
+    changes = np.abs(np.diff(slopes, axis=0))
+    changes[~np.isfinite(changes)] = np.inf
+    best, places = changes.argmin(axis=0), np.arange(len(size))
+    column, change = slopes[best + 1, places], changes[best, places]
+    noise = np.maximum(_NOISE * change, _ROUNDING * (size + np.abs(column).max()))
+    return np.where(np.abs(column) <= noise, 0.0, _rounded(column))
 
 
 def _rounded(values: Matrix) -> Matrix:

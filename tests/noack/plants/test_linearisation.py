@@ -115,3 +115,13 @@ def test_dry_friction_is_found_by_the_error() -> None:
     linear = linearise(at, 1, 1, x0=x)
     assert largest_errors(at, linear, np.full(2, 0.1), x0=x, u0=u)[0] == 0.0
     assert largest_errors(at, linear, np.full(2, 0.5), x0=x, u0=u)[0] > 0.1
+
+
+def test_a_jump_at_the_point_is_left_out() -> None:
+    """A shaft at standstill with dry and viscous friction has the slope of the viscous friction."""
+
+    def shaft(_: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
+        return z[1], v[0] - 2.0 * z[1] - 3.0 * np.sign(z[1]) + math.sin(z[0])
+
+    linear = linearise(lambda x0: OdeSystem(PlantEquations(shaft), x0), 2, 1)
+    assert np.allclose(np.hstack([linear.A, linear.B]), [[0, 1, 0], [1, -2, 1]], atol=1e-9)
