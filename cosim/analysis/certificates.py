@@ -33,14 +33,14 @@ from noack.theory.certificates.conditions import (
     nominal_conditions,
 )
 from noack.theory.certificates.network_limits import NetworkLimits, network_limits
-from noack.theory.certificates.output_bounds import output_bounds
+from noack.theory.certificates.output_bounds import OutputBound, output_bounds
 from noack.theory.certificates.plant_equations import LinearEquations, linear_plant
 from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.certificates.refusals import refusal_under, refusals_about_reference
 from noack.theory.certificates.region import RegionScope
 from noack.theory.certificates.scenario_certificates import box_scope, outside_box, own_plant_scope
 from noack.theory.certificates.trigger_weight import choose_weight
-from noack.theory.coverage import NOT_COVERED, refusals, require_certifiable
+from noack.theory.coverage import NOT_COVERED, refusals, require_certifiable, without_loads
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
 from noack.theory.witnesses.effort import MOST_WORK
@@ -125,7 +125,7 @@ class Certificates:
         self._arguments = (scenario, late_periods, weight, given, nonlinear, equations)
         self.threshold_advice = dict[str, str]()
         """By output: what brings it within its allowed error, see :meth:`advise`."""
-        require_certifiable(_without_loads(scenario), "linear", "whole run")
+        require_certifiable(without_loads(scenario), "linear", "whole run")
         self.setpoint, void = scenario.controller.setpoint, refusals_about_reference(scenario)
         if OWN_PLANT in void:
             raise CallerError(void[OWN_PLANT])
@@ -195,9 +195,7 @@ class Certificates:
         if certificate is None or not scenario.coverage.is_linear:
             return
         plants = "box" if certificate.scope == BOX else "own"
-        bounds = output_bounds(
-            certificate, self.scenario.loop_outputs(), self.setpoint, follows=self.follows_reference
-        )
+        bounds = self.output_bounds(certificate)
         for index, bound in enumerate(bounds):
             if not bound.is_met:
                 stated = ThresholdTrials(scenario, self.late_periods, plants)
@@ -368,9 +366,7 @@ class Certificates:
             "outputs": [
                 {"under": under, "plants": certificate.scope, **bound.to_json()}
                 for under, certificate in self
-                for bound in output_bounds(
-                    certificate, self.scenario.loop_outputs(), self.setpoint, follows=self.follows_reference
-                )
+                for bound in self.output_bounds(certificate)
             ],
             "unproven": [each._asdict() for each in self.unproven],
             "stability": None if self.stability is None else self.stability._asdict(),
@@ -380,6 +376,20 @@ class Certificates:
             "limits": {scope: limits._asdict() for scope, limits in self.limits_by_scope.items()},
             "largest_settings": [dict(tried.values) for tried in self.largest_settings],
         }
+
+    @property
+    def rest(self) -> dict[str, float]:
+        """Where the plant rests under its constant loads, by states: those whose rest is not 0."""
+        loop = loop_of(self.scenario)
+        own = zip(loop.state_names, loop.rest[: loop.n - loop.loads].tolist(), strict=False)
+        return {name: value for name, value in own if value}
+
+    def output_bounds(self, certificate: ScenarioCertificate) -> list[OutputBound]:
+        """Return the bounds of the scenario's outputs by one of its certificates."""
+        return output_bounds(
+            certificate, self.scenario.loop_outputs(), self.setpoint,
+            follows=self.follows_reference, rest=loop_of(self.scenario).rest.tolist(),
+        )  # fmt: skip
 
     def _covering(self, plants: str, conditions: str) -> ScenarioCertificate | None:
         fitting = (certificate for certificate in self._of(conditions) if certificate.scope == plants)
@@ -455,11 +465,6 @@ def with_linear_plant(resolved: Scenario) -> Scenario:
     """Return the scenario with its model as the plant."""
     plant = resolved.plant.model_copy(update={"system": LinearSettings()})
     return resolved.model_copy(update={"plant": plant})
-
-
-def _without_loads(resolved: Scenario) -> Scenario:
-    """Return a scenario without its loads: no bound is computed with them, but one may be proven."""
-    return resolved.model_copy(update={"model": resolved.model.model_copy(update={"load_states": 0})})
 
 
 def certificates_of(

@@ -13,7 +13,7 @@ from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.analysis.tried_settings import TriedSettings
 from cosim.output.document import Block, Document, Sentence, SentenceRole
-from cosim.output.guarantee_sentence import bounds_of, guarantee_sentence
+from cosim.output.guarantee_sentence import guarantee_sentence
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
 from noack.core.linear_systems import Matrix
@@ -71,6 +71,7 @@ def _all_tables(results: Certificates) -> Iterator[Block]:
             "x is the distance from the set-point, x − x_r. If the plant does not rest there, "
             "A x_r + B u_r is a disturbance: a step at the state."
         )
+    yield from _about_rest(results)
     yield from tables[1:]
     if largest := _listed("as settings, the certificate is kept", results.largest_settings):
         yield _prose(largest)
@@ -87,12 +88,13 @@ def _few_lines(results: Certificates) -> Iterator[Sentence]:
     """Yield the bounds of the outputs and of ‖x‖, what they assume, and what would void them."""
     certificate = results.guaranteed
     if certificate is not None:
-        bounds = bounds_of(results, certificate) if results.scenario.outputs else []
+        bounds = results.output_bounds(certificate) if results.scenario.outputs else []
         for bound in [bound for bound in bounds if bound.output.allowed is not None][:_MOST_BOUNDS]:
             yield _prose(f"{bound.formula} ({_how_known(is_proven=bound.is_proven)})")
         if results.scenario.outputs:  # else the first sentence has it
             state = envelope_formula("‖x‖", certificate, "state").format(at_most(certificate.first("state")))
             yield _prose(f"{state} ({_how_known(is_proven=certificate.is_proven('state'))})")
+        yield from _about_rest(results)
         apart_s = certificate.inter_event_s
         if apart_s is not None and apart_s < MOST_S:
             yield _prose(_apart_in_words(certificate, apart_s))
@@ -103,6 +105,13 @@ def _few_lines(results: Certificates) -> Iterator[Sentence]:
     if (outside := outside_box(results.scenario)) is not None:
         yield _doubt("the stated uncertainty does not contain this plant:", outside)
     yield from map(_prose, _stability_in_words(results))
+
+
+def _about_rest(results: Certificates) -> Iterator[Sentence]:
+    """Yield where the loop rests under its loads, if that is not at 0."""
+    if results.rest:
+        rest = ", ".join(f"{name} = {number(value)}" for name, value in results.rest.items())
+        yield _prose(f"x is the distance from where the loop rests under its load: {rest}")
 
 
 def _first_sentence(results: Certificates) -> Sentence:

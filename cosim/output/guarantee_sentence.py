@@ -7,7 +7,7 @@ from noack.core.number_format import at_most, counted
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 from noack.theory.certificates.conditions import BOX, REGION
-from noack.theory.certificates.output_bounds import OutputBound, output_bounds
+from noack.theory.certificates.output_bounds import OutputBound
 
 _MOST_OUTPUTS = 4
 """Outputs without an allowed error that the sentence names."""
@@ -19,20 +19,13 @@ def guarantee_sentence(results: Certificates) -> str | None:
     if certificate is None:
         return None
     statements = _statements(
-        bounds_of(results, certificate), certificate, stated=results.scenario.outputs is not None
+        results.output_bounds(certificate), certificate, stated=results.scenario.outputs is not None
     )
     known = "proved" if certificate.is_proven("state") else "computed, not proved"
     plants = {BOX: ", for every plant within the stated uncertainty", REGION: ", on its region"}
     losses = although_lost(results.scenario)
     until = "" if results.jump_s is None else f", until the reference jumps at {results.jump_s:g} s"
     return f"{' and '.join(statements)}{until}{losses}{plants.get(certificate.scope, '')} ({known})"
-
-
-def bounds_of(results: Certificates, certificate: ScenarioCertificate) -> list[OutputBound]:
-    """Return the bounds of a scenario's outputs by one of its certificates."""
-    return output_bounds(
-        certificate, results.scenario.loop_outputs(), results.setpoint, follows=results.follows_reference
-    )
 
 
 def _statements(

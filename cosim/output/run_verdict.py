@@ -90,7 +90,8 @@ def verdict(summary: RunSummary) -> tuple[Sentence, ...]:
 
 def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
     """Return what became of the outputs, and what was guaranteed of them, in one sentence."""
-    held = [claim for claim in loop.claims if claim.output and claim.verdict == "held"]
+    claims = [claim for claim in loop.claims if claim.until_s is None]  # they hold to the end of the run
+    held = [claim for claim in claims if claim.output and claim.verdict == "held"]
     guaranteed = {claim.output: claim.what for claim in held if " stays within " in claim.what}
     texts, is_good = [], True
     for output in loop.outputs:
@@ -102,7 +103,8 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
         else:
             since = f"from {output.settled_s:.3g} s on"
             texts.append(f"{output.name} was within {allowed} of its {output.target} {since}")
-        promised = guaranteed.get(output.name, "").rpartition(" from ")[2]
+        what = guaranteed.get(output.name, "")
+        promised = what.rpartition(" from ")[2] if f" of its {output.target} " in what else ""
         texts[-1] += f" (guaranteed from {promised})" if promised else " (not guaranteed)"
         is_good = is_good and output.settled_s is not None
     if not texts:

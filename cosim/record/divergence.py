@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.references import Reference
 from noack.core.row_operations import all_entries, row_norms
 from noack.disturbances.step import StepDisturbance
 from noack.scenario.resolution import loop_of, policy_of
@@ -99,16 +100,15 @@ def _scale(scenario: Scenario) -> float:
             )
             until_s = min(disturbance.until_s or scenario.horizon_s, scenario.horizon_s)
             displacement += float(np.linalg.norm(push)) * max(until_s - disturbance.from_s, 0.0)
-    reference = largest_reference(scenario)
+    reference = largest_reference(loop.reference, scenario)
     threshold = policy_of(scenario).largest_threshold
     if loop.weight is not None:
         threshold /= float(np.linalg.svd(loop.weight, compute_uv=False)[-1])
     return max(displacement, reference, threshold)
 
 
-def largest_reference(scenario: Scenario) -> float:
-    """Return the largest ‖x_r‖ of a resolved scenario, at sampled times."""
-    reference = loop_of(scenario).reference
+def largest_reference(reference: Reference | None, scenario: Scenario) -> float:
+    """Return the largest ‖x_r‖ in a resolved scenario, at sampled times."""
     if reference is None:
         return 0.0
     t_ns = np.linspace(0, scenario.timing.horizon_ns, _REFERENCE_SAMPLES).astype(np.int64)

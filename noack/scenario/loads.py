@@ -15,6 +15,7 @@ the input, E = B, has Γ = −I and Π = 0: u = Kx − d, and every state goes t
 A resolved scenario has the loads in its matrices, at the end of the plant's state, too.
 """
 
+import math
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -191,6 +192,28 @@ def _steps(scenario: ScenarioTables, load: Vector) -> list[StepDisturbance]:
         steps.append(StepDisturbance(kind="step", at="state", amplitude=amplitude, **around_s))
         load = np.array(change.load)
     return steps
+
+
+def first_load_change_s(resolved: ScenarioTables) -> float:
+    """Return when the loads of a resolved scenario first change; infinite if they do not."""
+    return min((change.from_s for change in _load_changes(resolved)), default=math.inf)
+
+
+def with_constant_load(resolved: S) -> S:
+    """Return a resolved scenario whose loads stay those of time 0."""
+    changes = _load_changes(resolved)
+    if not changes:
+        return resolved
+    kept = tuple(each for each in resolved.plant.disturbances if each not in changes)
+    return resolved.model_copy(update={"plant": resolved.plant.model_copy(update={"disturbances": kept})})
+
+
+def _load_changes(resolved: ScenarioTables) -> list[StepDisturbance]:
+    n = len(resolved.model.A or ()) - resolved.model.load_states
+    return [
+        each for each in resolved.plant.disturbances
+        if isinstance(each, StepDisturbance) and each.at == "state" and any(each.amplitude[n:])
+    ]  # fmt: skip
 
 
 def padded(disturbance: DisturbanceSettings, k: int) -> DisturbanceSettings:

@@ -61,6 +61,10 @@ _SURELY_FINITE = 600.0
 computed."""
 
 
+_CANCELLED = 1e-9
+"""A sum that is a smaller share of its terms is 0, but for rounding."""
+
+
 @dataclass(frozen=True)
 class LoopMatrices:
     """The matrices of a resolved scenario, in the paper's notation (n states, m inputs)."""
@@ -87,6 +91,20 @@ class LoopMatrices:
         known = self.x0.copy()
         known[self.n - self.loads :] = 0.0
         return known
+
+    @property
+    def rest(self) -> Vector:
+        """(Πd, d), (n,): where the loop rests under the loads d of x(0); 0 without loads."""
+        own = self.n - self.loads
+        rest = np.concatenate([np.zeros(own), self.x0[own:]])
+        if rest.any():
+            closed_loop = self.A + self.B @ self.K
+            inverse = np.linalg.pinv(closed_loop[:own, :own])
+            moved = inverse @ closed_loop[:own, own:] @ rest[own:]
+            terms = np.abs(inverse) @ (np.abs(self.A) + np.abs(self.B) @ np.abs(self.K))[:own, own:]
+            is_rounding = np.abs(moved) <= _CANCELLED * (terms @ np.abs(rest[own:]))
+            rest[:own] = np.where(is_rounding, 0.0, -moved)
+        return rest
 
     @property
     def without_loads(self) -> "LoopMatrices":

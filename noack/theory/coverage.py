@@ -57,6 +57,11 @@ def require_exact(scenario: Scenario) -> None:
         )
 
 
+def without_loads(resolved: Scenario) -> Scenario:
+    """Return a scenario without its loads: no bound is computed with them, but one may be proven."""
+    return resolved.model_copy(update={"model": resolved.model.model_copy(update={"load_states": 0})})
+
+
 def _unbounded_age(scenario: Scenario) -> str | None:
     """Return why the applied input has no largest age, or the watchdog replaces it.
 

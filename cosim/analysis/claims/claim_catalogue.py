@@ -398,7 +398,10 @@ def output_claims(run: RunEvidence, certificate: ScenarioCertificate) -> list[Cl
     claims = []
     stated = (run.whole_record or run.record).scenario.controller
     follows = stated.reference is not None
-    for bound in output_bounds(certificate, scenario.loop_outputs(), stated.setpoint, follows=follows):
+    rest = run.record.loop.rest.tolist()
+    for bound in output_bounds(
+        certificate, scenario.loop_outputs(), stated.setpoint, follows=follows, rest=rest
+    ):
         if (settles_s := bound.settles_s) is not None:
             claims.append(_output_claim(bound, bound.statement, settles_s))
         claims.append(_output_claim(bound, f"{bound.output.name} is bounded"))

@@ -29,6 +29,7 @@ from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.number_format import at_least, at_most
 from noack.core.references import Reference
+from noack.scenario.loads import first_load_change_s
 from noack.scenario.resolution import loop_of
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -185,7 +186,11 @@ class RunClaims:
 
     @property
     def _reference(self) -> Reference | None:
-        return loop_of(self.record.scenario).reference
+        """What certificates bound the distance from: the reference, or the rest under constant loads."""
+        loop = loop_of(self.record.scenario)
+        if loop.reference is None and loop.loads:
+            return Reference.constant(loop.rest, np.zeros(loop.m))  # the proof is about the inputs themselves
+        return loop.reference
 
     @cached_property
     def evidence(self) -> RunEvidence:
@@ -201,7 +206,7 @@ class RunClaims:
         error = None
         if reference.is_constant and reference.input(0).any():  # the input is 0 at first, and not u_r
             error = start_error(moved, self._evidence(moved).started_s)
-        return self._evidence(moved, None, error, largest_reference(self.record.scenario))
+        return self._evidence(moved, None, error, largest_reference(reference, self.record.scenario))
 
     def _evidence(
         self,
@@ -214,6 +219,7 @@ class RunClaims:
         until_s = changes[0] * 1e-9 if changes else math.inf  # as the times of samples are computed
         if record is not self._checked_record and (at_s := jump_s(self.record.scenario)) is not None:
             until_s = min(until_s, at_s)
+        until_s = min(until_s, first_load_change_s(self.record.scenario))
         void = refusals_about_reference(self.record.scenario, knows_inputs=True)
         whole, most_work = self.record, self.most_work
         return RunEvidence(record, whole, until_s, error, void, certificates, offset, most_work)

@@ -17,6 +17,7 @@ from cosim.analysis.witnesses import (
 )
 from noack.core.clock import NS_PER_S
 from noack.plants.systems.traced_equations import NotEnclosedError
+from noack.scenario.loads import with_constant_load
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.assumptions import Assumption, assumptions
@@ -109,7 +110,11 @@ def certificates_under(
 def with_proofs(
     certificates: Sequence[ScenarioCertificate], scenario: Scenario, most_work: float
 ) -> list[ScenarioCertificate]:
-    """Return certificates of a resolved scenario with what is proven under their conditions."""
+    """Return certificates of a resolved scenario with what is proven under their conditions.
+
+    What is proven of a loop with loads holds until they first change.
+    """
+    scenario = with_constant_load(scenario)
     if not scenario.certificate.prove:
         return [*certificates]
     content = resolved_content(scenario, scenario.certificate.late_periods)

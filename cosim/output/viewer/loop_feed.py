@@ -210,8 +210,8 @@ class LoopFeed:
     @cached_property
     def _certificate(self) -> ScenarioCertificate | None:
         """The run's certificate; None if there is none. Computed at first use, since it is slow."""
-        if not self._is_certified or self._loop.reference is not None:
-            return None  # with a reference, it bounds the deviations from it
+        if not self._is_certified or self._loop.reference is not None or self._loop.loads:
+            return None  # with a reference or loads, it bounds the deviations from it
         computed = certify(self._scenario, allowed_conditions(self._scenario))
         (certificate,) = run_certificates.with_proofs([computed], self._scenario, 0.0)  # as far as known
         if certificate.inter_event_s is not None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from cosim.analysis.certificates import Certificates, certificates_of, with_linear_plant, with_weight
 from cosim.analysis.claims.run_certificates import RUN_WORK
-from cosim.output.guarantee_sentence import bounds_of, guarantee_sentence
+from cosim.output.guarantee_sentence import guarantee_sentence
 from cosim.output.run_verdict import SETTLED_SHARE
 from cosim.record.run_directory import refuse_among_results
 from cosim.simulation.virtual_time import simulate_loops
@@ -357,7 +357,7 @@ class _TrialScenarios:
                 break
             shares = [
                 bound.ultimate / bound.output.allowed
-                for bound in bounds_of(results, certificate)
+                for bound in results.output_bounds(certificate)
                 if bound.output.allowed is not None
             ]
             largest = max(shares, default=1.0)

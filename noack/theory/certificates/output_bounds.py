@@ -1,7 +1,8 @@
 """What a certificate says about each output, in its own unit.
 
 From |y(t)| ≤ D₁e^{−rt} + D₂ follows from when on an output stays within its allowed error a: from
-t = ln(D₁/(a − D₂))/r on, if D₂ < a. With a set-point, y is the output's distance from it.
+t = ln(D₁/(a − D₂))/r on, if D₂ < a. With a set-point, y is the output's distance from it; with loads, from
+where the loop rests under them.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ class OutputBound(NamedTuple):
     certificate: ScenarioCertificate
     """With the bound of the output in the place of that of ‖x‖."""
     is_deviation: bool = False
-    """Whether the output has a set-point other than 0, or a reference."""
+    """Whether the output has a set-point or rest other than 0, or a reference."""
     target: str = "set-point"
     """What the output is to follow."""
 
@@ -101,6 +102,7 @@ def output_bounds(
     setpoint: Sequence[float] | None = None,
     *,
     follows: bool = False,
+    rest: Sequence[float] = (),
 ) -> list[OutputBound]:
     """Return the bound of each output; none without a bound of ‖x‖.
 
@@ -109,13 +111,16 @@ def output_bounds(
         outputs: its p outputs.
         setpoint: x_r, n entries; None is 0.
         follows: the loop follows a reference that changes over time instead.
+        rest: where it rests under its constant loads, n entries; without loads 0 or none.
     """
     if certificate.first("state") is None:
         return []
     bounds = []
     for index, output in enumerate(outputs):
-        moved = sum(c * x for c, x in zip(output.row, setpoint or (), strict=False))
-        target = "reference" if follows else "set-point"
+        moved, rests = (
+            any(c * x for c, x in zip(output.row, point, strict=False)) for point in (setpoint or (), rest)
+        )
+        target = "reference" if follows else "rest under the load" if rests else "set-point"
         of_output = certificate.of_output(index, output.row)
-        bounds.append(OutputBound(output, of_output, follows or bool(moved), target))
+        bounds.append(OutputBound(output, of_output, follows or moved or rests, target))
     return bounds

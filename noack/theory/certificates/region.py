@@ -38,7 +38,7 @@ from noack.theory.certificates.constants_search import Phases
 from noack.theory.certificates.plant_equations import LinearEquations, enclosed_motion, linear_plant
 from noack.theory.certificates.refusals import refusal_under
 from noack.theory.certificates.scenario_certificates import CertificateScope, box_scope, own_plant_scope
-from noack.theory.coverage import refusals
+from noack.theory.coverage import refusals, without_loads
 
 _WIDER = 1.02
 """The next region is larger than the bounds by this factor."""
@@ -64,7 +64,7 @@ def scopes(resolved: Scenario, start_error: float | None = None) -> list[Certifi
     These are its own plant and the box around it, if it is linear by its settings; otherwise its
     plant, on a region if its equations are not linear.
     """
-    if not refusals(resolved, "linear"):
+    if not refusals(without_loads(resolved), "linear"):
         linear = own_plant_scope(resolved, start_error), box_scope(resolved, start_error)
         return [scope for scope in linear if scope is not None]
     return [] if refusals(resolved) else [nonlinear_scope(resolved)]
