@@ -10,9 +10,10 @@ from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.claims.run_certificates import RUN_WORK, certificates_under, with_proofs
 from cosim.analysis.summary.summary_model import Claim
 from cosim.analysis.witnesses import find_statement, resolved_content
-from cosim.record.run_record import RunRecord
+from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.number_format import at_most
+from noack.protocol.record_tables import PLANT_STEP
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
 from tests.helpers.shipped import resolved
@@ -123,3 +124,47 @@ def test_outputs_are_claimed_with_their_bounds_and_allowed_errors() -> None:
     late = run["plant_step"]["t_ns"] * 1e-9 >= settles_s
     assert stays.observed == pytest.approx(np.abs(run["plant_step"]["x"][late, 0]).max())
     assert (stays.output, stays.origin) == ("position", "certificate (proved)")
+
+
+BELT = (
+    # A load that the voltage cannot cancel: dφ/dt = ω + d, so the shaft rests at 0 with ω = −d.
+    "model.load=[[1.0],[309.75]]", 'model.hold=["shaft_angle"]', "horizon_s=4",
+    'outputs=[{name="shaft_angle",row=[1,0],allowed=0.1},{name="speed",row=[0,1],allowed=2.0}]',
+)  # fmt: skip
+
+
+def test_bounds_of_a_loop_with_a_load_are_checked_about_its_rest() -> None:
+    record = simulate(resolved("dc_motor_load", *BELT))
+    claims = claims_of(record)
+    (settles,) = [what for what in claims if what.startswith("speed stays within 2 of its rest under")]
+    assert any(what.startswith("shaft_angle stays within 0.1 of its set-point from") for what in claims)
+    assert {claim.proved for claim in claims.values()} == {True}
+    steps = record[PLANT_STEP]
+    later = steps["t_ns"] * 1e-9 >= float(settles.split(" from ")[1].split(" s on")[0])
+    assert claims[settles].observed == pytest.approx(np.abs(steps["x"][later, 1] + 0.2).max(), rel=1e-6)
+    state, distance = claims["the state is bounded"], np.hypot(steps["x"][:, 0], steps["x"][:, 1] + 0.2)
+    _, rate_text = state.bound.split(" e^(−")
+    limit = state.certified * np.exp(-steps["t_ns"] * 1e-9) + float(rate_text.split("+ ")[1])
+    assert state.ratio == pytest.approx((distance / limit).max(), rel=1e-3)
+
+
+def test_they_hold_until_the_load_changes() -> None:
+    record = simulate(resolved("dc_motor_load", *BELT, "plant.load_changes=[{at_s=3.5,load=[-0.4]}]"))
+    claims = claims_of(record)
+    assert claims["the state is bounded"].until_s == pytest.approx(3.5, abs=0.002)
+    assert claims["the state is bounded"].proved
+
+
+def test_what_a_run_exceeds_about_its_rest_is_violated() -> None:
+    record = simulate(resolved("dc_motor_load", *BELT))
+    far = record.derived(
+        record.scenario, lambda table, rows: _with_x(rows, 3.0) if table == PLANT_STEP else rows
+    )
+    verdicts = {claim.what: claim.verdict for claim in RunClaims(far, most_work=RUN_WORK).evaluate()}
+    assert verdicts["shaft_angle is bounded"] == verdicts["the state is bounded"] == "violated"
+
+
+def _with_x(rows: Rows, angle: float) -> Rows:
+    moved = rows.copy()
+    moved["x"][:, 0] = angle
+    return moved
