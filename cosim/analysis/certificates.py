@@ -488,6 +488,8 @@ def certificates_of(
         CallerError: the choice is unknown, or no certificate covers this scenario.
     """
     original = resolve(scenario)
+    if original.model.load_states:
+        require_certifiable(original)  # whatever the plant's equations are
     linear = linear_plant(original)
     is_model = of_model and not original.coverage.is_linear and linear is None
     resolved = with_linear_plant(original) if is_model else linear or original

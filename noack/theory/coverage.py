@@ -33,8 +33,8 @@ def refusals(scenario: Scenario, *of: Statement) -> tuple[str, ...]:
     Without ``of`` it is about all certificates, those of a plant on a region, too.
     """
     lines = [line for _, line in key_table().refusals(scenario.content(), of)]
-    age = _unbounded_age(scenario)
-    return (*lines, *([] if age is None else [age]))
+    others = (_unbounded_age(scenario), _load_of_equations(scenario))
+    return (*lines, *(line for line in others if line is not None))
 
 
 def refusal(scenario: Scenario, *of: Statement) -> str | None:
@@ -55,6 +55,14 @@ def require_exact(scenario: Scenario) -> None:
             f"{reason}; this needs a linear plant with u = K x_c and a trigger rule of noack, without "
             "acknowledgements, lost actuations, disturbances, noise and observer"
         )
+
+
+def _load_of_equations(scenario: Scenario) -> str | None:
+    """Return why a plant that is not linear by its settings has none with a load."""
+    if not scenario.model.load_states or scenario.coverage.is_linear:
+        return None
+    kind = scenario.plant.system.kind
+    return f'model.load: with plant.system.kind = "{kind}" no bound is computed, and none is proven'
 
 
 def without_loads(resolved: Scenario) -> Scenario:

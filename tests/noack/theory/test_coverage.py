@@ -98,6 +98,11 @@ def test_a_plant_that_is_not_linear_may_have_a_certificate_on_a_region() -> None
         require_exact(scenario)
 
 
+def test_a_plant_that_is_not_linear_has_no_certificate_with_a_load() -> None:
+    with pytest.raises(CallerError, match=r'^model\.load: with plant\.system\.kind = "dc_motor" no bound'):
+        certificates_of(shipped("dc_motor", 'model.load="input"'), of_model=True)
+
+
 @pytest.mark.parametrize(
     "settings",
     [
