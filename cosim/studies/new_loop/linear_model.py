@@ -54,6 +54,9 @@ class SampledError(NamedTuple):
     """Largest sampled error of each state's derivative, relative, (n,)."""
 
 
+Source = Literal["derivative", "beside", "motion", "exact", "known"]
+
+
 @dataclass(frozen=True)
 class LinearModel:
     """A plant's linear model ẋ ≈ drift + A (x − at) + B (u − input); n states, m inputs.
@@ -68,7 +71,7 @@ class LinearModel:
     at: Vector
     input: Vector
     drift: Vector
-    source: Literal["derivative", "motion", "exact", "known"]
+    source: Source
     """Where A and B are from, in this order: differences of the plant's derivative, the logarithm of
     its motion over a step, its own matrices, or the loop's Â and B̂."""
     errors: tuple[SampledError, ...]
@@ -131,6 +134,7 @@ class LinearModel:
             return "the scenario's [model], which sensor and controller know of the plant"
         source = {
             "derivative": "differences of the plant's derivative",
+            "beside": "differences of the plant's derivative, beside a steep step, as of friction",
             "motion": f"the matrix logarithm of the plant's motion over {self.plant.step_ns * 1e-9:g} s",
             "exact": "the plant's own matrices",
         }[self.source]
@@ -147,7 +151,7 @@ class LinearModel:
             worst = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
             name = self.plant.state_names[worst]
             yield f"relative error within ±{within:g}, sampled: up to {error[worst]:.2g} ({name})"
-        if self.errors and self._is_rough(*(error.of_states for error in self.errors)):
+        if self.is_rough:
             yield "the error does not shrink with the neighbourhood: the plant is not smooth there"
         yield f"eigenvalues: {eigenvalue_text(self.eigenvalues)} /s"
         yield f"controllable: {self.rank} of {len(self.A)} states (tolerance {TOLERANCE:g})"
@@ -155,10 +159,18 @@ class LinearModel:
             effect = "stable" if uncontrollable[0].real < 0 else "no gain stabilises the plant"
             yield f"not controllable: the eigenvalues {eigenvalue_text(uncontrollable)} /s: {effect}"
 
-    @staticmethod
-    def _is_rough(wide: Vector, narrow: Vector) -> bool:
-        """Return whether the errors of the states hardly shrink with the neighbourhood."""
+    @property
+    def is_rough(self) -> bool:
+        """Whether the errors of the states hardly shrink with the neighbourhood."""
+        if not self.errors:
+            return False
+        wide, narrow = (error.of_states for error in self.errors)
         return bool((narrow > np.maximum(_ROUGH_SHARE * wide, _SMALL_ERROR)).any())
+
+    @property
+    def largest_error(self) -> float:
+        """The relative error of the worst state in the wider neighbourhood."""
+        return float(np.where(np.isnan(wide := self.errors[0].of_states), np.inf, wide).max())
 
 
 @dataclass(frozen=True)
@@ -248,21 +260,35 @@ def linearise(
     reference = plant_reference(plant, settings, sizes)
     x, u = parse_vector("at", at, reference.n, "states"), parse_vector("input", input, reference.m, "inputs")
     point = {"x0": x, "u0": u, "step_ns": reference.step_ns}
+    widths = () if reference.matrices else (within, within / 10)
+
+    def model_of(motion: LinearMotion, source: Source) -> LinearModel:
+        if motion.void is not None:
+            raise CallerError(f"{plant}: no linear model: {motion.void}")
+        errors = []
+        for width in widths:
+            halfwidths = np.full(reference.n + reference.m, width)
+            of_states = largest_errors(reference.system_at, motion, halfwidths, **point)  # type: ignore[arg-type]
+            errors.append(SampledError(width, of_states))
+        return LinearModel(reference, motion.A, motion.B, x, u, motion.drift, source, tuple(errors))
+
+    def moved(*, beside_steps: bool) -> LinearModel:
+        motion = linear_motion(
+            reference.system_at,
+            reference.n,
+            reference.m,
+            beside_steps=beside_steps,
+            **point,  # type: ignore[arg-type]
+        )
+        return model_of(motion, "beside" if beside_steps else motion.source)
+
     with np.errstate(all="ignore"):
-        exact = reference.matrices or reference.system.linearisation()
-        if exact is None:
-            motion = linear_motion(reference.system_at, reference.n, reference.m, **point)  # type: ignore[arg-type]
-        else:
-            motion = LinearMotion(*exact, exact[0] @ x + exact[1] @ u, "motion")
-    if motion.void is not None:
-        raise CallerError(f"{plant}: no linear model: {motion.void}")
-    errors = []
-    for width in () if reference.matrices else (within, within / 10):
-        halfwidths = np.full(reference.n + reference.m, width)
-        of_states = largest_errors(reference.system_at, motion, halfwidths, **point)  # type: ignore[arg-type]
-        errors.append(SampledError(width, of_states))
-    source = motion.source if exact is None else "exact"
-    return LinearModel(reference, motion.A, motion.B, x, u, motion.drift, source, tuple(errors))
+        if (exact := reference.matrices or reference.system.linearisation()) is not None:
+            return model_of(LinearMotion(*exact, exact[0] @ x + exact[1] @ u, "motion"), "exact")
+        model = moved(beside_steps=False)
+        if not model.is_rough or model.source != "derivative":
+            return model
+        return min(model, moved(beside_steps=True), key=lambda each: each.largest_error)
 
 
 def gain(

@@ -53,6 +53,7 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate, enve
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import own_plant_scope
 from noack.theory.coverage import require_certifiable
+from noack.theory.witnesses.effort import MOST_WORK
 from noack.trigger_policies.decaying import DecayingSettings
 
 _FLOOR_SHARE = 0.05
@@ -69,6 +70,8 @@ _OTHER_WEIGHT = 0.01
 """Weight of a state without an allowed error in the regulator, where others have one, with weight 1."""
 _INPUT_WEIGHTS = (1.0, 10.0, 100.0)
 """r of the regulators that are tried: with a larger one the gain is slower."""
+_FRICTION_INPUT_WEIGHTS = (0.01, 0.1, 1.0)
+"""The same with allowed errors, if friction keeps an output off by its size over the gain."""
 _LOOSE_BOUND_RATIO = 200.0
 """A bound of ‖x‖ above this multiple of ‖x(0)‖ is used only if there is no other."""
 _DEFAULT_START = 0.1
@@ -253,11 +256,17 @@ def _initial_state(model: LinearModel, fixed_state: object) -> Vector:
     return np.where(is_rate, 0.0, _DEFAULT_START) if not all(is_rate) else np.full(n, _DEFAULT_START)
 
 
-def _list_trials(model: LinearModel | LoopGain, x0: Vector, allowed: Mapping[str, float]) -> Iterator[_Trial]:
+def _list_trials(
+    model: LinearModel | LoopGain,
+    x0: Vector,
+    allowed: Mapping[str, float],
+) -> Iterator[_Trial]:
     """Yield what is tried, the preferred settings first; states without an allowed error may move."""
-    plant = model.model.plant if isinstance(model, LoopGain) else model.plant
+    linear = model.model if isinstance(model, LoopGain) else model
+    plant, has_friction = linear.plant, linear.source == "beside"
+    input_weights = _FRICTION_INPUT_WEIGHTS if allowed and has_friction else _INPUT_WEIGHTS
     q = [1.0 if name in allowed else _OTHER_WEIGHT for name in plant.state_names] if allowed else None
-    gains = [model] if isinstance(model, LoopGain) else [gain(model, q=q, r=r) for r in _INPUT_WEIGHTS]
+    gains = [model] if isinstance(model, LoopGain) else [gain(model, q=q, r=r) for r in input_weights]
     for loop_gain in gains:
         fastest = max(
             (size for size in np.abs(loop_gain.eigenvalues) if size < _FASTEST_EIGENVALUE_PER_S), default=1
@@ -269,7 +278,8 @@ def _list_trials(model: LinearModel | LoopGain, x0: Vector, allowed: Mapping[str
         for rate_hz in (usual_hz,) if is_fixed else (usual_hz, 2 * usual_hz):
             for mansd in range(DEFAULT_MANSD, 0, -1):
                 for share in (ALPHA_SHARE, ALPHA_SHARE / 2):
-                    fastest_per_s = math.inf if allowed else _FASTEST_ALPHA_PER_S
+                    is_fast = allowed and not has_friction  # friction does not decay
+                    fastest_per_s = math.inf if is_fast else _FASTEST_ALPHA_PER_S
                     alpha = to_digits(min(share * loop_gain.decay_per_s, fastest_per_s))
                     yield _Trial(loop_gain, rate_hz, mansd, alpha, x0)
 
@@ -350,17 +360,12 @@ class _TrialScenarios:
         for number in range(_MOST_THRESHOLDS):
             report(f"searching for proofs{f': threshold {number + 1}' if number else ''}")
             results = certificates_of(self.scenario(trial), of_model=True)
-            results.prove(most_work=2 * RUN_WORK, conditions=("schedule",))
-            certificate = results.guaranteed
+            most_work = 2 * RUN_WORK if self.is_linear else MOST_WORK
+            results.prove(most_work=most_work, conditions=("schedule",))
             used = results.scenario.trigger
-            if certificate is None or is_fixed or not isinstance(used, DecayingSettings):
+            if results.guaranteed is None or is_fixed or not isinstance(used, DecayingSettings):
                 break
-            shares = [
-                bound.ultimate / bound.output.allowed
-                for bound in results.output_bounds(certificate)
-                if bound.output.allowed is not None
-            ]
-            largest = max(shares, default=1.0)
+            largest = self.largest_share(results)
             if _LEAST_USE <= largest <= 1.0 or number == _MOST_THRESHOLDS - 1:
                 break
             wanted = to_digits(min(used.floor * _MOST_USE / largest, used.beta / 2), 2)
@@ -368,6 +373,17 @@ class _TrialScenarios:
                 break
             trial = replace(trial, floor=wanted)
         return trial, results
+
+    @staticmethod
+    def largest_share(results: Certificates) -> float:
+        """Return the largest share of an allowed error that its bound has in the end.
+
+        It is infinite without a bound.
+        """
+        if results.guaranteed is None:
+            return math.inf
+        outputs = [bound for bound in results.output_bounds(results.guaranteed) if bound.output.allowed]
+        return max((bound.ultimate / (bound.output.allowed or 1.0) for bound in outputs), default=1.0)
 
     @property
     def _losses(self) -> str:

@@ -67,6 +67,7 @@ def linearise(
     x0: Vector | None = None,
     u0: Vector | None = None,
     step_ns: int = STEP_NS,
+    beside_steps: bool = False,
 ) -> LinearMotion:
     """Linearise a system.
 
@@ -77,6 +78,8 @@ def linearise(
         x0: x₀, (n,); by default 0.
         u0: u₀, (m,); by default 0.
         step_ns: step of a system that is moved.
+        beside_steps: where the derivative has a steep step at the point, as smoothed dry friction does,
+            take the slope beside it.
     """
     x0, u0 = np.zeros(n) if x0 is None else x0, np.zeros(m) if u0 is None else u0
     rates = getattr(system_at(x0), "rates", None)
@@ -87,14 +90,14 @@ def linearise(
         return np.asarray(rates(point[:n], point[n:]))
 
     point = np.concatenate([x0, u0])
-    jacobian, drift = _differences(f, point), f(point)
+    jacobian, drift = _differences(f, point, beside_steps=beside_steps), f(point)
     void = None if np.isfinite(jacobian).all() and np.isfinite(drift).all() else NOT_FINITE
     if void is None and not np.array_equal(f(point), drift):
         void = NOT_REPEATED
     return LinearMotion(jacobian[:, :n], jacobian[:, n:], drift, "derivative", void)
 
 
-def _differences(f: Callable[[Vector], Vector], point: Vector) -> Matrix:
+def _differences(f: Callable[[Vector], Vector], point: Vector, *, beside_steps: bool) -> Matrix:
     """Return the Jacobian of f, (n, len(point)); NaN where f is not finite."""
     columns = []
     size = np.abs(f(point))
@@ -112,6 +115,9 @@ def _differences(f: Callable[[Vector], Vector], point: Vector) -> Matrix:
         if jumps.any():
             beside = _steadiest(np.diff(rises, axis=0) / np.diff(steps)[:, None], size)
             column = np.where(jumps, beside, column)
+        if beside_steps:
+            is_step = np.abs(rises[1]) > 0.5 * np.abs(rises[0])
+            column = np.where(is_step, _rounded((rises[0] - rises[1]) / (steps[0] - steps[1])), column)
         columns.append(column)
     return np.array(columns).T
 

@@ -272,6 +272,10 @@ def trace(system: PlantSystem, n: int, m: int, widths: Vector, *, signals: bool 
         expressions = system.expressions(log.add("time"), x, u)
     except TypeError as error:  # of an extension that uses math.sin
         raise NotEnclosedError(f"its equations are for floats alone: {one_line(error)}") from None
+    except NotEnclosedError:
+        raise
+    except NoackError as error:  # of a user's class that uses it
+        raise NotEnclosedError(str(error)) from None
     if expressions is None:
         raise NotEnclosedError("x is neither its state nor its state minus a constant")
     rates, states = expressions
