@@ -6,7 +6,7 @@ from cosim.analysis.certificates import Certificates
 from noack.core.number_format import at_most, counted
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
-from noack.theory.certificates.conditions import BOX, REGION
+from noack.theory.certificates.conditions import BOX
 from noack.theory.certificates.output_bounds import OutputBound
 
 _MOST_OUTPUTS = 4
@@ -22,10 +22,10 @@ def guarantee_sentence(results: Certificates) -> str | None:
         results.output_bounds(certificate), certificate, stated=results.scenario.outputs is not None
     )
     known = "proved" if certificate.is_proven("state") else "computed, not proved"
-    plants = {BOX: ", for every plant within the stated uncertainty", REGION: ", on its region"}
+    plants = ", for every plant within the stated uncertainty" if certificate.scope == BOX else ""
     losses = although_lost(results.scenario)
     until = "" if results.jump_s is None else f", until the reference jumps at {results.jump_s:g} s"
-    return f"{' and '.join(statements)}{until}{losses}{plants.get(certificate.scope, '')} ({known})"
+    return f"{' and '.join(statements)}{until}{losses}{plants} ({known})"
 
 
 def _statements(
