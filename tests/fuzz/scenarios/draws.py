@@ -18,6 +18,7 @@ FILE = "scenario.toml"
 _LOOP_SEEDS = ("plant", "initial_state", "disturbance", "noise")
 
 NEVER_DRAWN: Mapping[str, str] = {
+    "LoopSection.outputs": "the table of a scenario with one loop",
     "ModelSection.load_states": "of resolved scenarios, which have the loads in their matrices",
     "ModelSection.controller_states": "of resolved scenarios, which have these states in their matrices",
     "StateSpaceSettings.setpoint": "refused: the state is computed from the measured x",
