@@ -83,7 +83,15 @@ def reference_segments(
         return _given_segments(pieces, A, B, horizon_s)
     timelines = _timelines(pieces, rows, A, B)
     C = np.array([rows[output] for output in timelines])
-    return _solved(list(timelines.values()), A, B, C, _places(pieces))
+    places = _places(pieces)
+    segments = _solved(list(timelines.values()), A, B, C, places)
+    if (failed := _inexact_segment(segments, A, B, horizon_s)) is not None:
+        begin_ns = segments[failed].begin_ns
+        place = [place for since_ns, place in places if since_ns <= begin_ns][-1]
+        raise PieceError(
+            place, "join_s: too short for a solution of the model that is exact; take a longer one"
+        )
+    return segments
 
 
 def _of_file(
@@ -116,11 +124,20 @@ def _given_segments(
             raise PieceError(place, "from_s: the first segment begins at 0, each other one later")
         end_ns = segment.begin_ns
         segments.append(segment)
-    ends_ns = [*(segment.begin_ns for segment in segments[1:]), _ns(horizon_s)]
-    for place, (segment, end_ns) in enumerate(zip(segments, ends_ns, strict=True)):
-        if not _is_solution(segment, max(end_ns - segment.begin_ns, 0) * 1e-9, A, B):
-            raise PieceError(place, "x: not a solution of the model, ẋ_r = Âx_r + B̂u_r")
+    if (failed := _inexact_segment(segments, A, B, horizon_s)) is not None:
+        raise PieceError(failed, "x: not a solution of the model, ẋ_r = Âx_r + B̂u_r")
     return segments
+
+
+def _inexact_segment(
+    segments: Sequence[ReferenceSegment], A: Matrix, B: Matrix, horizon_s: float
+) -> int | None:
+    """Return the number of a segment that is no solution of the model until the next one; None: all are."""
+    ends_ns = [*(segment.begin_ns for segment in segments[1:]), _ns(horizon_s)]
+    for number, (segment, end_ns) in enumerate(zip(segments, ends_ns, strict=True)):
+        if not _is_solution(segment, max(end_ns - segment.begin_ns, 0) * 1e-9, A, B):
+            return number
+    return None
 
 
 def _is_solution(segment: ReferenceSegment, length_s: float, A: Matrix, B: Matrix) -> bool:
