@@ -1,6 +1,7 @@
 """The settings that every piece of a reference has, and the signal that a piece describes."""
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -85,6 +86,6 @@ class OutputPiece(PieceSettings):
     join_s: TimeS = 0.0
     """Time in which the output goes over from its earlier value to this piece, smoothly; 0: at once."""
 
+    @abstractmethod
     def signal(self, start: float) -> OutputSignal:
         """Return the piece's signal; τ is the time since its begin, ``start`` the value before it."""
-        raise NotImplementedError
