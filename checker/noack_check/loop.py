@@ -14,7 +14,7 @@ class Memory(NamedTuple):
     """A number η that a rule keeps between tests, whose positive part the rule's right side has in addition.
 
     From one test to the next one, T later, η becomes e^{−λT} η + (1 − e^{−λT})/λ · zᵀΨz with z = (x, e_s) at
-    the first of both.
+    the first of both: after the event if it is one, so that e_s is 0.
     """
 
     decay: arb  # λ, 1/s

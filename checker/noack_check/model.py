@@ -588,7 +588,8 @@ class Model:
             if self.memory is None or not is_test:
                 found.append(Edge(name, source, target, pairs, jump, facts, is_test))
                 continue
-            following = self._next_memory(self.memory, places.clock_end(move.target))
+            until = places.clock_end(move.target)
+            following = self._next_memory(self.memory, until, resets=move.is_event)
             grown, none = (*facts, -1 * following), (*facts, following)
             found.append(Edge(name, source, target, pairs, jump, grown, is_test, following))
             nothing = zeros(self.size, self.size)
@@ -615,17 +616,23 @@ class Model:
         copies = [*(v + added for v in self.v[: place.later]), added] if move.kind == "later" else []
         return self.jump(self.noise, self.w + added, copies)
 
-    def _next_memory(self, memory: Memory, until: fmpq) -> arb_mat:
-        """Return η at the next test, with y² for η, as a form of z."""
+    def _next_memory(self, memory: Memory, until: fmpq, *, resets: bool) -> arb_mat:
+        """Return η at the next test, with y² for η, as a form of z at this one, before an event.
+
+        ``resets``: the test is an event, after which the measurement has no error.
+        """
         eta, decay = square(self.y), (-1 * memory.decay * until).exp()
         gained = arb(until) if memory.decay == 0 else (1 - decay) / memory.decay
-        return decay * eta + gained * (transpose(self._pair) * memory.gain * self._pair)
+        n, pair = self.loop.n, self._pair
+        if resets:
+            pair = stack([rows_of(pair, range(n)), zeros(pair.nrows() - n, self.size)])
+        return decay * eta + gained * (transpose(pair) * memory.gain * pair)
 
-    def memory_after_test(self) -> arb_mat:
-        """Return the form of η after a test; 0 for a rule without a memory."""
+    def memory_after_test(self, *, resets: bool) -> arb_mat:
+        """Return the form of η after a test, which may be an event; 0 for a rule without a memory."""
         if self.memory is None:
             return zeros(self.size, self.size)
-        return self._next_memory(self.memory, self.loop.times.sampling)
+        return self._next_memory(self.memory, self.loop.times.sampling, resets=resets)
 
     @property
     def memory_at_start(self) -> float:
@@ -880,7 +887,7 @@ class Model:
         terms.add(self.form(index, 0), at_start, at_start, arb(-1) / 2)
         if self.memory is not None and self._places is not None:
             until, root = self._places.clock_end(self._places.places[index]), self.memory.start.sqrt()
-            Q = self._next_memory(self.memory, until)
+            Q = self._next_memory(self.memory, until, resets=True)
             z_eta = z + transpose(self.y) * arb_mat(1, z.ncols(), [root] + [0] * (z.ncols() - 1))
             self._add_memory(terms, index, 0, -1 * (transpose(z_eta) * Q * z_eta))
         terms.facts("m/start", self._noise_bounds, z)

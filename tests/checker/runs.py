@@ -132,9 +132,9 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
             threshold = np.hypot(threshold, np.sqrt(max(eta, 0.0)))
             fires = np.linalg.norm(positive @ seen) > threshold or (rule.always and rng.random() < 0.2)
             fires = fires and t - events[-1] > dwell - 1e-9
-            remembered.test(seen)
             if periods[1]:
                 fires = t >= next_event
+            remembered.test(seen if not fires else np.concatenate([y, 0 * seen[n:]]))
             if fires:
                 if t < first_input and proof.is_quiet:
                     found.append(Exceeded("an event before the first input", t, 0.0, first_input))

@@ -100,9 +100,11 @@ class _Runs:
             self._z[half:, n : 2 * n] = threshold / np.sqrt(n) * errors
         self.memory = np.flatnonzero(floats(model.y).any(axis=0))
         """The place of y in z, if there is one."""
-        self._remembered = floats(model.memory_after_test())
+        self._remembered, self._after_event = (
+            floats(model.memory_after_test(resets=resets)) for resets in (False, True)
+        )
         self._z[:, self.memory] = model.memory_at_start
-        self._z[:, self.memory] = self._next_memory()
+        self._z[:, self.memory] = self._next_memory(np.ones(_RUNS, bool))
         self._since_event, self._dwell = np.zeros(_RUNS), _seconds(self._loop.times.dwell)
         self._missing = np.zeros(_RUNS, int)
         self._later, self._most = np.zeros(_RUNS, int), model.later
@@ -128,7 +130,7 @@ class _Runs:
             self._flow(step)
             self._z[:, self._noise] = self._rng.choice([-1.0, 1.0], (_RUNS, len(self._noise)))
             event = self._events(step)
-            remembered = self._next_memory()
+            remembered = self._next_memory(event)
             self._jump(event)
             self._z[:, self.memory] = remembered
             self._observe()
@@ -158,9 +160,10 @@ class _Runs:
         self._since_event[event] = 0
         return event
 
-    def _next_memory(self) -> Matrix:
+    def _next_memory(self, event: NDArray[np.bool_]) -> Matrix:
         """Return y of all runs after tests, (_RUNS, 1)."""
-        return np.sqrt(np.maximum(self._quadratic(self._remembered), 0.0))[:, None]
+        eta = np.where(event, self._quadratic(self._after_event), self._quadratic(self._remembered))
+        return np.sqrt(np.maximum(eta, 0.0))[:, None]
 
     def _jump(self, event: NDArray[np.bool_]) -> None:
         z, delay_s = self._z, _seconds(self._loop.times.delay)
