@@ -232,8 +232,8 @@ class Evaluation:
         """Return C of g = g₀ + Cz for states and inputs; None if it is not linear."""
         states = self.n + self.m
         is_known = all(slope.rad() <= _NARROW for slope in a.slopes)
-        if a.rest != 0 or not is_known or any(slope != 0 for slope in a.slopes[states:]):
-            return None
+        if not (a.rest == 0 and is_known and all(slope == 0 for slope in a.slopes[states:])):
+            return None  # a ball around 0 is not 0
         return arb_mat(1, states, a.slopes[:states])
 
     def _signal(self, size: arb, row: arb_mat | None, least: arb) -> Enclosed:
@@ -304,7 +304,7 @@ class Evaluation:
             if rest > 0:
                 columns.append([rest if k == i else arb(0) for k in range(n)])
                 along.append(unknown_signal)
-        kept = [index for index, column in enumerate(columns) if any(entry != 0 for entry in column)]
+        kept = [k for k, column in enumerate(columns) if not all(entry == 0 for entry in column)]
 
         def block(M: arb_mat, first: int, last: int) -> arb_mat:
             return arb_mat(n, last - first, [M[i, k] for i in range(n) for k in range(first, last)])

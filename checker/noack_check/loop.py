@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import columns_of, frobenius, identity, is_positive, is_zero, rows_of, stack, zeros
+from noack_check.balls import columns_of, frobenius, identity, is_positive, is_zero, rows_of, stack, transpose, zeros
 
 _MOST_STATES, _MOST_LOSSES = 40, 1000
 """A proof of a larger loop would take hours."""
@@ -187,7 +187,7 @@ class Loop(NamedTuple):
         if not self.holds:
             return None
         if rule.of_input:
-            return self.gain if m < n else None
+            return self.gain if m < n and (self.gain * transpose(self.gain)).det() > 0 else None
         columns = [rule.positive, rule.negative, *([] if memory is None else [memory.gain])]
         parts = [self.gain, *(columns_of(M, range(n, 2 * n)) for M in columns)]
         seen = [i for i in range(n) if not all(is_zero(columns_of(M, [i])) for M in parts)]
@@ -247,6 +247,9 @@ class Loop(NamedTuple):
             moving.append(self.push_before_input)
         if not all(is_zero(rows_of(M, constant)) for M in moving):
             return "loads: they may change, or are not 0 in these coordinates"
+        compared_forms = [rule.positive, rule.negative, *([] if rule.memory is None else [rule.memory.gain])]
+        if self.loads and not all(is_zero(columns_of(M, range(n))) for M in compared_forms if M.nrows()):
+            return "loads: the rule compares x, which is not 0 where the loop rests"
         if self.observer is not None:
             is_known = is_zero(self.half_A) and is_zero(self.half_B)
             if not (is_known and self.model_A == self.A and self.model_B == self.B):

@@ -881,7 +881,8 @@ class Model:
         if self.s.nrows():
             z += transpose(self.s) * self.bounds.smooth.start
         if self._sources:
-            z = beside(z, transpose(self._error) * self.bounds.columns + transpose(self.p))
+            error = transpose(self._errors[0]) * self._reduced(self.bounds.columns)
+            z = beside(z, error + transpose(self.p))
         at_start = rows_of(z, self.locations[index].coordinates)
         terms = _Terms(z.ncols())
         terms.add(self.form(index, 0), at_start, at_start, arb(-1) / 2)

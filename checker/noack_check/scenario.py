@@ -189,10 +189,12 @@ def _start(resolved: Table, plants: _Plants, x_r: Sequence[float]) -> _Start:
     if any(any(row) for M in matrices for row in M[n:]):
         raise RefusedError("model.load_states: the last states are not constant")
     pushes = _disturbances(plant, matrix(plants.B), matrix(plants.half_B))
-    if any(entry != 0 for column in pushes for entry in column[n:]):
+    if not all(entry == 0 for column in pushes for entry in column[n:]):
         raise RefusedError("plant.disturbances: the load changes, and its statement is for a constant one")
     if any(map(any, (*plants.half_A, *plants.half_B))):
         raise RefusedError("model.load_states: the statement is for one plant, not for all in a box")
+    if resolved.get("mode") != "zoh" and (plants.A, plants.B) != of_model:
+        raise RefusedError("model.load_states: where the plant rests, a model that differs from it does not")
     A, B, K = matrix(plants.A), matrix(plants.B), matrix(_matrix(model, "model.gain"))
     closed, own = A + B * K, range(n)
     load = rows_of(x_0, range(n, n + k))
@@ -662,7 +664,7 @@ def _product(M: arb_mat, v: Sequence[float]) -> list[arb]:
 
 
 def _nonzero(column: list[arb]) -> Iterator[list[arb]]:
-    if any(entry != 0 for entry in column):
+    if not all(entry == 0 for entry in column):  # also a ball around 0
         yield column
 
 

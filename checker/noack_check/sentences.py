@@ -122,8 +122,8 @@ def formula(bound: Bound, rate: arb) -> str:
         last = bound.constant if rate > 0 else (bound.decaying**2 + bound.constant**2).sqrt()
         return f"{at_most(last)} in the limit"
     decay = f" e^(−{at_least(rate)} t)" if rate > 0 else ""
-    parts = [f"{at_most(bound.decaying)}{decay}"] if bound.decaying != 0 else []
-    if bound.constant != 0:
+    parts = [] if bound.decaying == 0 else [f"{at_most(bound.decaying)}{decay}"]
+    if not bound.constant == 0:  # also a ball around 0
         parts.append(at_most(bound.constant))
     return " + ".join(parts) or "0"
 

@@ -12,7 +12,7 @@ from flint import arb
 
 from cosim.analysis.witnesses import find_region_statement, resolved_content
 from noack.core.linear_systems import Matrix, Vector
-from noack.plants.systems.traced_equations import trace
+from noack.plants.systems.traced_equations import NotEnclosedError, trace
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.witnesses.coordinates import floats
@@ -93,6 +93,38 @@ def test_friction_is_a_signal_that_takes_energy() -> None:
     [(row, least)] = plants.along
     assert floats(row).tolist() == [[0.0, 1.0, 0.0]]
     assert least == 0
+
+
+def test_a_small_signal_is_no_missing_one() -> None:
+    """clip(x₁ sign(x₂)) has a slope of at most 1e-13 along the sign, which is not 0."""
+    steps = [["state", 0], ["state", 1], ["sign", 1], ["times", 2, 0], ["clip", 3, -1e-14, 1e-14]]
+    plants = enclose({"steps": steps, "rates": [4, 1]}, Region((arb(1e-13), arb(1)), (arb(1),)))
+    assert all(least == 0 for _, least in plants.along)
+
+
+def test_a_signal_of_which_the_size_is_around_0_is_kept() -> None:
+    steps = [["state", 0], ["state", 1], ["number", 1e9], ["times", 1, 2], ["sign", 0], ["cos", 1],
+             ["number", -1.0], ["add", 5, 6], ["times", 4, 7], ["add", 3, 8]]  # fmt: skip
+    plants = enclose({"steps": steps, "rates": [9, 1]}, Region((arb(1), arb(1e-3)), (arb(1),)))
+    # 1e9 x₂ + (cos x₂ − 1) sign x₁
+    assert plants.pushes.ncols() > 0
+    size = sum((plants.pushes[0, k].abs_upper() for k in range(plants.pushes.ncols())), arb(0))
+    assert size >= 4e-7
+
+
+BUFFER = np.zeros(1)
+OPTIONS: dict[str, Field] = {
+    "out": lambda x, u: [np.sin(x[1], out=BUFFER)[()] and BUFFER[0], u[0]],
+    "clip into an array": lambda x, u: [x[1], np.clip(u[0], -1.0, 1.0, out=BUFFER)],
+    "a limit of infinity": lambda x, u: [x[1], np.minimum(u[0], -np.inf)],
+    "a limit that is no number": lambda x, u: [x[1], np.clip(u[0], np.nan, 1.0)],
+}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_what_is_not_noted_has_no_enclosure(name: str) -> None:
+    with pytest.raises(NotEnclosedError):
+        trace(Plant(OPTIONS[name]), 2, 1, np.array([0.8, 0.6, 1.5]))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,32 @@ def test_loads_that_do_not_stay_constant_are_refused() -> None:
         read_loop(tables, box=False, ideal=False)
 
 
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+def test_a_model_that_differs_from_the_plant_does_not_rest_with_it(mode: str) -> None:
+    tables = motor(f'mode="{mode}"')
+    del tables["observer"]
+    tables["plant"]["measurement"] = {"C": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
+    assert read_loop(tables, box=False, ideal=False).fault() == ""
+    tables["plant"]["A"][1][1] *= 1.3
+    if mode == "zoh":
+        assert read_loop(tables, box=False, ideal=False).fault() == ""
+        return
+    with pytest.raises(RefusedError, match="differs"):
+        read_loop(tables, box=False, ideal=False)
+
+
+@pytest.mark.parametrize(
+    "trigger", [{"policy": "relative", "sigma": 0.1}, {"policy": "mixed", "sigma": 0.1, "epsilon": 0.1}]
+)
+def test_a_rule_that_compares_x_is_rejected_with_loads(trigger: dict[str, Any]) -> None:
+    """Where the loop rests x is not 0, so events come later than about 0."""
+    tables = motor()
+    tables["trigger"] = trigger
+    assert read_loop(tables, box=False, ideal=False).fault() == (
+        "loads: the rule compares x, which is not 0 where the loop rests"
+    )
+
+
 def test_the_shaft_has_a_proven_bound(statement: WitnessedStatement) -> None:
     assert statement.bounds is not None
     bound = statement.bounds.bounds["y[0]"]

@@ -208,6 +208,18 @@ def test_each_way_to_the_next_memory_has_an_edge() -> None:
         assert z @ floats(edge.memory) @ z == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("gain", [[[-1.0, -1.4]], [[0.0, 0.0]]])
+def test_a_loop_starts_with_the_noise_of_its_measurement(gain: list[list[float]]) -> None:
+    """With forms of K e_s, too: it is what an event leaves. A gain without rank has none of K e_s."""
+    loop = dynamic()._replace(holds=True, noise=matrix([[0.01, 0.0], [0.0, 0.02]]), gain=matrix(gain))
+    model = Model(loop, arb(0), arb(1))
+    assert model.sees_all == (gain[0][0] == 0)
+    z = floats(model.jump(model.noise, 0 * model.w, ())) @ floats(model.p).T
+    [start] = {name: floats(left) for name, left, _ in model.start_inequality().parts}.values()
+    [(_, form)] = model.form(0, 0).parts
+    assert abs(start[:, 1:]) == pytest.approx(abs(floats(form) @ z[[*model.locations[0].coordinates]]) / 2)
+
+
 # False witnesses.
 
 

@@ -52,8 +52,9 @@ class TracedNumber:
     def __init__(self, trace: "_Trace", index: int) -> None:
         self._trace, self.index = trace, index
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **_: object) -> Any:
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: object) -> Any:
         """Return a function of numpy."""
+        _require_no_options(ufunc.__name__, options)
         if any(isinstance(value, np.ndarray) and value.ndim for value in inputs):
             return ufunc(*(np.asarray(value, dtype=object) for value in inputs))  # entry by entry
         operands = [value.item() if isinstance(value, np.ndarray) else value for value in inputs]
@@ -177,14 +178,22 @@ class TracedNumber:
         return self.clip(None, other)
 
     def clip(
-        self, low: float | None = None, high: float | None = None, out: None = None, **_: object
+        self, low: float | None = None, high: float | None = None, out: None = None, **options: object
     ) -> "TracedNumber":
         """See :func:`numpy.clip`; the limits are numbers."""
-        limits = [None if end is None or np.isinf(end) else float(end) for end in (low, high)]
+        _require_no_options("clip", {"out": out, **options})
+        sides = ((low, -np.inf), (high, np.inf))
+        limits = [None if end is None or end == nothing else float(end) for end, nothing in sides]
         return self._trace.add("clip", [self], limits)
 
     def _step(self, name: str, *others: Operand) -> "TracedNumber":
         return self._trace.add(name, [self, *map(self._trace.traced, others)])
+
+
+def _require_no_options(name: str, options: Mapping[str, object]) -> None:
+    """Refuse what numpy would do with a result, such as to write it into an array."""
+    if used := [key for key, value in options.items() if value is not None and value is not True]:
+        raise NotEnclosedError(f"np.{name} has no enclosure with {', '.join(used)}")
 
 
 def _is_array(value: object) -> bool:
