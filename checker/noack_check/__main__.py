@@ -20,7 +20,7 @@ from noack_check.growth import prove_growth, read_periodic_loop
 from noack_check.keys import RefusedError, Table
 from noack_check.proof import prove
 from noack_check.scenario import output_names, read_enclosed, read_loop
-from noack_check.sentences import assumptions, equations_text, growth_sentences, sentences
+from noack_check.sentences import assumptions, equations_text, growth_sentences, origin_text, sentences
 
 _PLANTS = {"own": "its plant", "box": "all plants of its uncertainty box", "region": "its plant's equations"}
 _CONDITIONS = {"ideal": "ideal conditions", "schedule": "its schedule"}
@@ -96,6 +96,8 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
         loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal", enclosed=enclosed)
         for sentence in sentences(prove(loop, document), output_names(scenario)):
             yield f"PROVED {of}: {sentence}"
+        if origin := origin_text(scenario, loop):
+            yield f"       where {origin}"
         yield f"       if there are {assumptions(scenario, loop)}"
         if enclosed is not None:
             yield f"       and the plant is {equations_text(document)}"

@@ -42,6 +42,15 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
     return ", ".join(parts)
 
 
+def origin_text(scenario: Mapping[str, object], loop: Loop) -> str:
+    """Return from where x and outputs count, in words; empty: from 0."""
+    if loop.loads:
+        return "x and outputs count from where the loop rests under its constant loads"
+    controller = scenario.get("controller")
+    setpoint = controller.get("setpoint", []) if isinstance(controller, Mapping) else []
+    return "x and outputs count from the set-point" if any(setpoint) else ""
+
+
 def equations_text(document: Mapping[str, object]) -> str:
     """Return the equations of a plant in a document that was accepted, which a statement is about."""
     equations = read_table(document, "equations")

@@ -9,10 +9,12 @@ from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolve
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
+from noack_check.__main__ import check_file
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
+from noack_check.sentences import origin_text
 from tests.checker.runs import floats
 from tests.helpers.resolved_tables import resolved_tables
 from tests.helpers.shipped import resolved, shipped
@@ -107,6 +109,15 @@ def test_the_shaft_has_a_proven_bound(statement: WitnessedStatement) -> None:
     assert bound.constant < 0.1
     assert statement.bounds.inter_event_s is not None
     assert statement.bounds.inter_event_s > 0.004
+
+
+def test_the_sentences_say_from_where_they_count(statement: WitnessedStatement) -> None:
+    lines = [*check_file({"scenario": motor(), "statements": [statement.document]}, None)]
+    assert any("where the loop rests under its constant loads" in line for line in lines)
+    loop = read_loop(resolved_tables("double_integrator"), box=False, ideal=False)
+    assert origin_text(resolved_tables("double_integrator"), loop) == ""
+    tables = resolved_tables("double_integrator", "controller.setpoint=[0.5,0.0]")
+    assert origin_text(tables, loop) == "x and outputs count from the set-point"
 
 
 def test_no_simulated_run_exceeds_it(statement: WitnessedStatement) -> None:
