@@ -4,7 +4,17 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import columns_of, frobenius, identity, is_positive, is_zero, rows_of, stack, transpose, zeros
+from noack_check.balls import (
+    columns_of,
+    frobenius,
+    identity,
+    is_positive,
+    is_zero,
+    rows_of,
+    stack,
+    transpose,
+    zeros,
+)
 
 _MOST_STATES, _MOST_LOSSES = 40, 1000
 """A proof of a larger loop would take hours."""

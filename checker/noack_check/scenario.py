@@ -193,7 +193,7 @@ def _start(resolved: Table, plants: _Plants, x_r: Sequence[float]) -> _Start:
         raise RefusedError("plant.disturbances: the load changes, and its statement is for a constant one")
     if any(map(any, (*plants.half_A, *plants.half_B))):
         raise RefusedError("model.load_states: the statement is for one plant, not for all in a box")
-    if resolved.get("mode") != "zoh" and (plants.A, plants.B) != of_model:
+    if resolved.get("mode") != "zoh" and of_model != (plants.A, plants.B):
         raise RefusedError("model.load_states: where the plant rests, a model that differs from it does not")
     A, B, K = matrix(plants.A), matrix(plants.B), matrix(_matrix(model, "model.gain"))
     closed, own = A + B * K, range(n)

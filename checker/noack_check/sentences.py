@@ -131,9 +131,8 @@ def formula(bound: Bound, rate: arb) -> str:
         last = bound.constant if rate > 0 else (bound.decaying**2 + bound.constant**2).sqrt()
         return f"{at_most(last)} in the limit"
     decay = f" e^(−{at_least(rate)} t)" if rate > 0 else ""
-    parts = [] if bound.decaying == 0 else [f"{at_most(bound.decaying)}{decay}"]
-    if not bound.constant == 0:  # also a ball around 0
-        parts.append(at_most(bound.constant))
+    sizes = ((bound.decaying, decay), (bound.constant, ""))
+    parts = [f"{at_most(value)}{end}" for value, end in sizes if not _is_zero(value)]
     return " + ".join(parts) or "0"
 
 
@@ -145,6 +144,11 @@ def at_most(value: arb) -> str:
 def at_least(value: arb) -> str:
     """Return four digits of a number that is at most the value."""
     return _rounded(value.lower() if value.rad() != 0 else value, ROUND_FLOOR)
+
+
+def _is_zero(value: arb) -> bool:
+    """Return whether a number is exactly 0; a ball around 0 is not."""
+    return bool(value == 0)
 
 
 def _rounded(value: arb, rounding: str) -> str:

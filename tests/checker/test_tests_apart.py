@@ -201,7 +201,7 @@ def test_each_way_to_the_next_memory_has_an_edge() -> None:
         x, seen = floats(model.x) @ z, floats(model.loop.gain) @ floats(model.e) @ z
         pair = np.concatenate([x, seen])
         step_s, decay = 0.02, float(memory.decay)
-        if not edge.name.split(", ")[1] == "silent":
+        if edge.name.split(", ")[1] != "silent":
             pair = np.concatenate([x, 0 * seen])  # an event leaves no error
         gained = -np.expm1(-decay * step_s) / decay * pair @ floats(memory.gain) @ pair
         expected = 0.0 if edge.name.endswith("none") else np.exp(-decay * step_s) * z[y] ** 2 + gained
