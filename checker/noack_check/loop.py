@@ -90,6 +90,8 @@ class Observer(NamedTuple):
     first_correction: arb_mat  # the same at the first test
     start: arb_mat  # x̂ − x before the first test, at t = 0, (n, 1)
     period: fmpq  # T, s, exactly between two tests
+    unfelt: int = 0
+    """So many disturbances, the last ones, are those of a reference: it predicts them exactly, too."""
 
 
 class Smooth(NamedTuple):
@@ -153,7 +155,11 @@ class Loop(NamedTuple):
     loads: int = 0
     """The last states are so many constants, which are 0 in these coordinates: see :mod:`.scenario`."""
     push_before_input: arb_mat | None = None
-    """What is added to ẋ while no input acts, (n, 1); None: 0."""
+    """What is added to ẋ while no input acts, (n, 1), of which a ball has all values; None: 0."""
+    until: fmpq | None = None
+    """Up to this time, in s, the loop is one with such disturbances; None: at all times."""
+    offset: arb = arb(0)
+    """x is at most this far from what statements are about: see :mod:`.reference`."""
 
     @property
     def output_rows(self) -> arb_mat:
@@ -249,6 +255,8 @@ class Loop(NamedTuple):
         for name, size in sizes.items():
             if not (size.is_finite() and size >= 0):
                 return f"{name}: not a number of at least 0"
+        if not (self.offset.is_finite() and self.offset >= 0):
+            return "offset: not a number of at least 0"
         if not 0 <= self.loads < n:
             return "loads: not fewer than states"
         constant = range(n - self.loads, n)
@@ -264,6 +272,8 @@ class Loop(NamedTuple):
             is_known = is_zero(self.half_A) and is_zero(self.half_B)
             if not (is_known and self.model_A == self.A and self.model_B == self.B):
                 return "observer: its model may not be the plant"
+            if not 0 <= self.observer.unfelt <= k:
+                return "observer: it predicts more disturbances than there are"
             if not (times.sampling > 0 and self.observer.period > 0):
                 return "observer: without tests at times"
         if self.along and [(a.row.nrows(), a.row.ncols()) for a in self.along] != [(1, n + m)] * k:

@@ -89,7 +89,7 @@ def _from_sources(loop: Loop, observer: Observer) -> list[arb]:
     """Return bounds of |W n| by entries, of what follows from noise and disturbances."""
     W, T, F = loop.weight, arb(observer.period), _step(loop, observer, observer.correction)
     sources = [W * columns_of(loop.noise, [i]) for i in range(loop.noise.ncols())]
-    for i, size in enumerate(loop.sizes):
+    for i, size in enumerate(loop.sizes[: len(loop.sizes) - observer.unfelt]):
         push = size * columns_of(loop.pushes, [i])
         for cell in range(_CELLS):
             during = ((cell * T / _CELLS + upto(T / _CELLS)) * loop.A).exp()

@@ -60,3 +60,23 @@ def decays_below(G: arb_mat, bound: arb, tail: arb_mat) -> bool:
             if step < arb(2) ** -30:
                 return False
     return False
+
+
+def lyapunov_function(F: arb_mat, Q: arb_mat) -> arb_mat | None:
+    """Return P ≻ 0 with FᵀP + PF = −Q, (n, n); None if it is not proven that there is one.
+
+    noack has the same one up to rounding.
+    """
+    n = F.nrows()
+    every = [(i, j) for i in range(n) for j in range(n)]
+    equations = arb_mat(
+        n * n,
+        n * n,
+        [F[k, i] * (j == m) + F[m, j] * (i == k) for i, j in every for k, m in every],
+    )
+    try:
+        solution = equations.solve(arb_mat(n * n, 1, [-Q[i, j] for i, j in every]))
+    except ZeroDivisionError:
+        return None
+    P = arb_mat(n, n, [(solution[i * n + j, 0] + solution[j * n + i, 0]) / 2 for i, j in every])
+    return P if is_positive(P) else None

@@ -24,13 +24,13 @@ from typing import Any, NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import around_zero, frobenius, identity, is_zero, upto
+from noack_check.balls import around_zero, frobenius, identity, is_zero, rows_of, upto
 from noack_check.check import RejectedError, verify
 from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
 from noack_check.loop import Loop, Noise, Region, Smooth, Times
 from noack_check.model import Chain, Errors, Model, thresholds
 from noack_check.noise import noise_of
-from noack_check.norms import decays_below, growth
+from noack_check.norms import decays_below, growth, spectral_norm
 
 MOST_PIECES = 64
 MOST_LATER = 8
@@ -112,7 +112,18 @@ def conclude(
         bounds.append(Bound("e_c", decaying, constant, True))
     if not all(size.is_finite() for bound in bounds for size in (bound.decaying, bound.constant)):
         raise RejectedError("bounds: not finite")
-    return Proof(rate, tuple(bounds), apart, first, is_quiet)
+    return Proof(rate, tuple(_about(loop, bound) for bound in bounds), apart, first, is_quiet)
+
+
+def _about(loop: Loop, bound: Bound) -> Bound:
+    """Return the bound of an output itself, x being at most ``loop.offset`` from where the loop has it."""
+    output, n = bound.output, loop.n
+    if loop.offset == 0 or output[0] not in "xy":
+        return bound
+    row = identity(n) if output == "x" else loop.output_rows if output[0] == "y" else identity(n)
+    if "[" in output:
+        row = rows_of(row, [int(output[2:-1])])
+    return bound._replace(constant=bound.constant + loop.offset * spectral_norm(row))
 
 
 class Assumptions(NamedTuple):
@@ -320,6 +331,10 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
     except ValueError as error:
         raise RejectedError(str(error)) from None
     output, starts = str(entry.get("output")), bool(entry.get("from_start", True))
+    if not starts and loop.until is not None:
+        raise RejectedError(f"{output[:50]}: no bound in the limit: the loop is known up to a time only")
+    if output[0:1] == "u" and loop.until is not None:
+        raise RejectedError(f"{output[:50]}: the input about a reference is not an output")
     counts = {"x": loop.n, "u": loop.B.ncols(), "y": loop.output_rows.nrows()}
     entries = {f"{kind}[{i}]" for kind, count in counts.items() for i in range(count)}
     if output not in {"x", "e_s", "e_c", "drift"} | entries:

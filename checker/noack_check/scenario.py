@@ -2,7 +2,8 @@
 
 Floats are the exact binary values that noack runs with. A scenario with a key that :mod:`.keys`
 refuses has no loop. What is moved to 0 is the set-point x_r: with Âx_r = 0 the models rest at it without
-an input, and what is left of the plant is a constant disturbance A x_r.
+an input, and what is left of the plant is a constant disturbance A x_r. A reference that changes over time
+is moved to 0, too: see :mod:`.reference`.
 """
 
 import math
@@ -16,7 +17,6 @@ from noack_check.balls import (
     beside,
     columns_of,
     identity,
-    is_positive,
     is_zero,
     matrix,
     number,
@@ -29,7 +29,9 @@ from noack_check.document import read_table
 from noack_check.equations import LinearPlants, enclose, read_region
 from noack_check.keys import RefusedError, Table, refusals
 from noack_check.loop import Along, Loop, Memory, Observer, Region, Rule, Times
-from noack_check.times import NS_PER_S, Schedule, fraction, nanoseconds
+from noack_check.norms import lyapunov_function, spectral_norm
+from noack_check.reference import Matrices, Moments, Segment, about_reference, padded
+from noack_check.times import NS_PER_S, Schedule, fraction, nanoseconds, nearest_ns
 
 Rows = Sequence[Sequence[float]]
 _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
@@ -52,7 +54,14 @@ class Enclosed(NamedTuple):
     region: Region
 
 
-def read_loop(resolved: Table, *, box: bool, ideal: bool, enclosed: Enclosed | None = None) -> Loop:
+def read_loop(
+    resolved: Table,
+    *,
+    box: bool,
+    ideal: bool,
+    enclosed: Enclosed | None = None,
+    longer: Mapping[str, fmpq] | None = None,
+) -> Loop:
     """Return the loop of a resolved scenario of one loop.
 
     Args:
@@ -61,6 +70,7 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool, enclosed: Enclosed | N
         ideal: the paper's conditions: no delay, inputs of age 0, tests at all times (at those of its
             grid for a rule that has one).
         enclosed: the equations of a plant that the scenario does not give by A and B.
+        longer: some times of :class:`.loop.Times` are at least these, in s.
 
     Raises:
         RefusedError: a key is not covered, is missing or has a wrong value.
@@ -79,7 +89,9 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool, enclosed: Enclosed | N
     _choice(_table(resolved, "network"), "network.initial_sync", ("first_packet", "known_state"))
     pushes = [*_disturbances(plant, matrix(plants.B), matrix(plants.half_B)), *_at_rest(plants.A, x_r)]
     weight = _weight(trigger, n)
-    rule = _rule(trigger, weight, model)
+    rule, times = _rule(trigger, weight, model), _times(resolved, trigger, ideal=ideal)
+    for name, least in (longer or {}).items():
+        times = times._replace(**{name: max(getattr(times, name), least)})
     loop = Loop(
         A=matrix(plants.A),
         B=matrix(plants.B),
@@ -96,13 +108,109 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool, enclosed: Enclosed | N
         noise=_noise(resolved, n),
         observer=_observer(resolved, plants, ideal=ideal),
         outputs=_outputs(resolved, n),
-        losses=_losses(_table(resolved, "network")),
-        times=_times(resolved, trigger, ideal=ideal),
+        losses=most_losses(resolved),
+        times=times,
         **_start(resolved, plants, x_r),
     )
     if enclosed is not None and loop.loads:
         raise RefusedError("model.load_states: not covered on a region")
+    if "reference" in _table(resolved, "controller"):
+        loop = _about_reference(loop, resolved)
     return loop if enclosed is None else _with_equations(loop, resolved, enclosed)
+
+
+def _about_reference(loop: Loop, resolved: Table) -> Loop:
+    """Return a loop about its reference, x_r(t), which is 0 in these coordinates."""
+    n, m, rule = loop.n, loop.B.ncols(), loop.rule
+    segments = _segments(_table(resolved, "controller"), n - loop.loads, m)
+    matrices = Matrices(loop.A, loop.B, loop.half_A, loop.half_B, loop.H, loop.gain)
+    moments = Moments(
+        loop.times.age, loop.times.start, fmpq(*_real(resolved, "horizon_s").as_integer_ratio())
+    )
+    about = about_reference(
+        [padded(segment, n - loop.loads, loop.loads) for segment in segments],
+        matrices,
+        moments,
+        _error_gain(loop),
+    )
+    if not about.offset.is_finite():
+        raise RefusedError(
+            "controller.reference: the models about it are not stable, and its pieces do not join exactly"
+        )
+    compares_x = rule.negative.nrows() or rule.memory is not None
+    if about.offset != 0 and (compares_x or not is_zero(columns_of(rule.positive, range(n)))):
+        raise RefusedError(
+            "trigger.policy: it compares with x, which jumps by rounding where two pieces join"
+        )
+    columns = [(size * columns_of(loop.B, [j])).entries() for j, size in enumerate(about.input)]
+    columns += [(size * columns_of(identity(n), [i])).entries() for i, size in enumerate(about.state)]
+    columns = [column for column in columns if any(entry != 0 for entry in column)]
+    before = about.before_input + (loop.push_before_input or zeros(n, 1))
+    added = arb_mat(n, len(columns), [column[i] for i in range(n) for column in columns])
+    return loop._replace(
+        start=loop.start - about.start,
+        pushes=beside(loop.pushes, added) if columns else loop.pushes,
+        sizes=(*loop.sizes, *[arb(1)] * len(columns)),
+        push_before_input=before if loop.push_before_input is not None or not is_zero(before) else None,
+        observer=None if loop.observer is None else loop.observer._replace(unfelt=len(columns)),
+        until=about.until,
+        offset=about.offset,
+    )
+
+
+def _error_gain(loop: Loop) -> arb | None:
+    """Return a bound of ‖e^{Hτ}‖ over all τ ≥ 0; None if H is not stable."""
+    if is_zero(loop.H):
+        return arb(1)
+    P = lyapunov_function(loop.H, identity(loop.n))
+    return None if P is None else (spectral_norm(P) * spectral_norm(P.inv())).sqrt()
+
+
+def _segments(controller: Table, n: int, m: int) -> list[Segment]:
+    """Return the segments of a reference of n states and m inputs."""
+    found: list[Segment] = []
+    for entry in _tables(controller, "controller.reference"):
+        _choice(entry, "controller.reference.kind", ("segment",))
+        hz = [number(f) for f in _row(entry, "controller.reference.hz")] if "hz" in entry else []
+        rows = {
+            key: _wide(entry, f"controller.reference.{key}", width) for key, width in (("x", n), ("u", m))
+        }
+        if len(rows["x"]) != len(rows["u"]):
+            raise RefusedError("controller.reference: x and u do not have as many coefficients")
+        waves = {}
+        for wave in ("sines", "cosines"):
+            names = ((f"x_{wave}", n), (f"u_{wave}", m))
+            waves[wave] = [
+                _wide(entry, f"controller.reference.{key}", width) if hz else [] for key, width in names
+            ]
+            if any(len(each) != len(hz) for each in waves[wave]):
+                raise RefusedError(f"controller.reference: not {wave} for each frequency")
+        begin = fmpq(nearest_ns(_real(entry, "controller.reference.from_s")), NS_PER_S)
+        if begin <= found[-1].begin if found else begin != 0:
+            raise RefusedError(
+                "controller.reference.from_s: the first segment begins at 0, each other one later"
+            )
+        sides = (
+            _by_columns(x, u, n + m) for x, u in ((rows["x"], rows["u"]), waves["sines"], waves["cosines"])
+        )
+        polynomial, sines, cosines = sides
+        found.append(Segment(begin, polynomial, hz, sines, cosines))
+    if not found:
+        raise RefusedError("controller.reference: no segment")
+    return found
+
+
+def _wide(table: Table, name: str, width: int) -> Rows:
+    rows = _matrix(table, name)
+    if len(rows[0]) != width:
+        raise RefusedError(f"{name}: not {width} numbers in a row")
+    return rows
+
+
+def _by_columns(x: Rows, u: Rows, height: int) -> arb_mat:
+    """Return a column of n + m numbers for each row of x and u."""
+    columns = [[*of_x, *of_u] for of_x, of_u in zip(x, u, strict=True)]
+    return arb_mat(height, len(columns), [number(column[i]) for i in range(height) for column in columns])
 
 
 def read_enclosed(resolved: Table, document: Table) -> Enclosed:
@@ -123,6 +231,8 @@ def _with_equations(loop: Loop, resolved: Table, enclosed: Enclosed) -> Loop:
     n, m = loop.n, plants.B.ncols()
     if loop.observer is not None:
         raise RefusedError("observer: not covered with a plant's equations")
+    if loop.until is not None:
+        raise RefusedError("controller.reference: not covered with a plant's equations")
     setpoint = _optional_table(resolved, "controller").get("setpoint")
     if setpoint is not None and any(_row({"setpoint": setpoint}, "controller.setpoint")):
         raise RefusedError("controller.setpoint: not covered with a plant's equations")
@@ -251,8 +361,9 @@ def output_names(resolved: Table) -> list[str]:
     return names
 
 
-def _losses(network: Table) -> int:
+def most_losses(resolved: Table) -> int:
     """Return the most consecutive losses that the guarantee allows."""
+    network = _table(resolved, "network")
     most = _whole(network, "network.mansd")
     for entry in _tables(network, "network.constraints"):
         if entry.get("kind") == "at_most":
@@ -494,7 +605,9 @@ def _dynamic(trigger: Table, n: int, model: Table) -> Rule:
     Q = matrix(_matrix(trigger, "trigger.Q")) if "Q" in trigger else identity(n)
     if (Q.nrows(), Q.ncols()) != (n, n):
         raise RefusedError(f"trigger.Q: not {n} x {n}")
-    P, keys = _lyapunov_function(A + B * K, Q), ("sigma", "theta_s", "decay_per_s", "eta_0")
+    if (P := lyapunov_function(A + B * K, Q)) is None:
+        raise RefusedError("trigger.policy: the closed loop of the model is not stable")
+    keys = ("sigma", "theta_s", "decay_per_s", "eta_0")
     sigma, theta, decay, start = (number(_real(trigger, f"trigger.{key}")) for key in keys)
     w = _blocks(sigma * Q, -1 * (P * B))
     zero = arb(0)
@@ -505,25 +618,6 @@ def _blocks(first: arb_mat, cross: arb_mat) -> arb_mat:
     """Return the symmetric matrix of two blocks above, and 0 below on the right; without radii."""
     whole = stack([beside(first, cross), beside(transpose(cross), zeros(cross.ncols(), cross.ncols()))])
     return arb_mat(whole.nrows(), whole.ncols(), [entry.mid() for entry in whole.entries()])
-
-
-def _lyapunov_function(F: arb_mat, Q: arb_mat) -> arb_mat:
-    """Return P with FᵀP + PF = −Q, (n, n); noack has the same one up to rounding."""
-    n = F.nrows()
-    every = [(i, j) for i in range(n) for j in range(n)]
-    equations = arb_mat(
-        n * n,
-        n * n,
-        [F[k, i] * (j == m) + F[m, j] * (i == k) for i, j in every for k, m in every],
-    )
-    try:
-        solution = equations.solve(arb_mat(n * n, 1, [-Q[i, j] for i, j in every]))
-    except ZeroDivisionError:
-        raise RefusedError("trigger.policy: no Lyapunov function of model.A and model.gain") from None
-    P = arb_mat(n, n, [(solution[i * n + j, 0] + solution[j * n + i, 0]) / 2 for i, j in every])
-    if not is_positive(P):
-        raise RefusedError("trigger.policy: the closed loop of the model is not stable")
-    return P
 
 
 def _squares(Q: arb_mat) -> tuple[arb_mat, arb_mat]:

@@ -37,6 +37,8 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
     rule = loop.rule
     if times.sampling == 0 and rule.positive.nrows() and rule.level == 0 and rule.floor == 0:
         parts.append("as long as events do not accumulate")  # nothing keeps two of them apart
+    if loop.until is not None:
+        parts.append(f"up to {float(arb(loop.until).mid()):g} s, all about the reference")
     if scenario.get("changes"):
         parts.append("until the first change of settings")
     return ", ".join(parts)

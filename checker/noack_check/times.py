@@ -39,6 +39,11 @@ def nanoseconds(seconds: float) -> int:
     return int(fraction(seconds) * NS_PER_S) if seconds else 0
 
 
+def nearest_ns(seconds: float) -> int:
+    """Return the nearest whole nanoseconds of a time, as the machines have it."""
+    return round(seconds * NS_PER_S)
+
+
 def period_ns(rate_hz: float) -> Fraction:
     """Return the period of a rate in nanoseconds."""
     exact = NS_PER_S / fraction(rate_hz)

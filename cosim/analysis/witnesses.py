@@ -11,6 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from flint import fmpq
 
 from cosim.analysis.witness_store import StoredSearch, WitnessStore
 from noack.core.errors import CallerError
@@ -187,7 +188,7 @@ def plant_on_regions(
     resolved: Scenario,
     content: Mapping[str, object],
     conditions: str,
-    adjusted: Callable[[Loop], Loop] = lambda loop: loop,
+    longer: Mapping[str, fmpq] | None = None,
 ) -> PlantOnRegions:
     """Return the loop of a resolved scenario with its plant's equations, for any region.
 
@@ -195,7 +196,7 @@ def plant_on_regions(
         resolved: the scenario.
         content: its tables, as :func:`resolved_content` returns them.
         conditions: "ideal" or "schedule".
-        adjusted: returns the loop with other times.
+        longer: some of the loop's times are at least these, in s.
 
     Raises:
         NotEnclosedError: the plant has no equations.
@@ -205,8 +206,8 @@ def plant_on_regions(
     def on(widths: Vector) -> tuple[TracedEquations, Loop]:
         traced, table = trace(system, loop.n, loop.m, widths), {"region": region_table(widths, loop.n)}
         enclosed = EnclosedPlant(traced.plants, read_region(table, loop.n, loop.m))
-        found = read_loop(content, box=False, ideal=conditions == "ideal", enclosed=enclosed)
-        return traced, adjusted(found)
+        is_ideal = conditions == "ideal"
+        return traced, read_loop(content, box=False, ideal=is_ideal, enclosed=enclosed, longer=longer)
 
     size = float(np.abs(loop.x0).max()) or 1.0
     typical = size * np.concatenate([np.ones(loop.n), np.abs(loop.K).sum(axis=1)])
@@ -264,7 +265,8 @@ def _wanted(loop: Loop, *, has_outputs: bool) -> tuple[Sequence[str], Sequence[s
     """Return the outputs to bound from the start on, and in the limit."""
     rows = tuple(f"y[{j}]" for j in range(loop.output_rows.nrows())) if has_outputs else ()
     outputs = ("x", *(rows if loop.outputs.nrows() else ()), "e_c")  # the drift bounds e_c, too
-    return outputs, (("x", *rows) if has_outputs and (loop.sizes or loop.noise.ncols()) else ())
+    is_disturbed = loop.until is None and bool(loop.sizes or loop.noise.ncols())
+    return outputs, (("x", *rows) if has_outputs and is_disturbed else ())
 
 
 def known_or_found_on_region(

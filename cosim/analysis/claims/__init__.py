@@ -4,7 +4,7 @@
    they violate. ``condition_reader.py`` reads them from the record; ``input_origins.py`` finds out
    which update each input of the plant was computed with.
 2. ``run_evidence.py``: signals, conditions and certificates, against which claims are checked;
-   ``run_certificates.py`` has the certificates of a run; ``setpoint_deviations.py``: the record about a
+   ``run_certificates.py`` has the certificates of a run; ``reference_deviations.py``: the record about a
    set-point; ``common_end.py``: a stopped run; ``trajectory_delta.py``: Theorem 1's Δ from a
    trajectory.
 3. ``claim_catalogue.py``: the claims.

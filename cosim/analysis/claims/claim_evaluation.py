@@ -19,8 +19,8 @@ import numpy as np
 from cosim.analysis.claims.claim_catalogue import CLAIMS, Bound, ClaimDefinition, Envelope, output_claims
 from cosim.analysis.claims.common_end import common_end_ns, up_to_common_end
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
+from cosim.analysis.claims.reference_deviations import deviations, start_error
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
-from cosim.analysis.claims.setpoint_deviations import deviations, start_error
 from cosim.analysis.summary.summary_model import NO_BOUND, Claim, ClaimVerdict, ViolationPart
 from cosim.record.decimation import decimate
 from cosim.record.divergence import largest_reference

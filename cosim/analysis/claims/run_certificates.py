@@ -28,8 +28,7 @@ from noack.theory.certificates.scenario_certificates import outside_box
 from noack.theory.witnesses.effort import NoWitnessError
 from noack.theory.witnesses.outward import proven_bounds
 from noack_check.keys import RefusedError
-from noack_check.loop import Loop
-from noack_check.scenario import read_loop
+from noack_check.scenario import most_losses, read_loop
 
 _FEW_LOOPS = 4
 RUN_WORK = 2.5
@@ -128,12 +127,13 @@ def _with_proof(
     if is_box and outside_box(scenario) is not None:
         return certificate
     with suppress(RefusedError, NoWitnessError, NotEnclosedError):
+        if certificate.conditions.dropouts > most_losses(content):
+            return certificate
         if certificate.scope not in (OWN_PLANT, BOX):
             return _with_region_proof(certificate, scenario, content, most_work)
-        loop = _under(read_loop(content, box=is_box, ideal=False), certificate.conditions)
-        if loop is not None:
-            witness = known_or_found(loop, lambda share: None, most_work)
-            return certificate.with_proof(proven_bounds(witness.proof, loop))
+        loop = read_loop(content, box=is_box, ideal=False, longer=_times(certificate.conditions))
+        witness = known_or_found(loop, lambda share: None, most_work)
+        return certificate.with_proof(proven_bounds(witness.proof, loop))
     return certificate
 
 
@@ -141,26 +141,12 @@ def _with_region_proof(
     certificate: ScenarioCertificate, scenario: Scenario, content: dict[str, object], most_work: float
 ) -> ScenarioCertificate:
     """Return a certificate with what is proven of a plant's equations."""
-
-    def adjusted(loop: Loop) -> Loop:
-        if (under := _under(loop, certificate.conditions)) is None:
-            raise NoWitnessError("the conditions allow more losses")
-        return under
-
-    plant = plant_on_regions(scenario, content, "schedule", adjusted)
+    plant = plant_on_regions(scenario, content, "schedule", _times(certificate.conditions))
     witness, loop = known_or_found_on_region(plant, lambda share: None, most_work)
     return certificate.with_proof(proven_bounds(witness.proof, loop))
 
 
-def _under(loop: Loop, conditions: NetworkConditions) -> Loop | None:
-    """Return a loop whose times are at least those of some conditions; None if these allow more losses."""
-    if conditions.dropouts > loop.losses:
-        return None
-    times, wanted = (
-        loop.times,
-        {"delay": conditions.delay_s, "age": conditions.hold_s, "start": conditions.start_s},
-    )
-    longer = {
-        name: max(getattr(times, name), fmpq(round(t_s * NS_PER_S), NS_PER_S)) for name, t_s in wanted.items()
-    }
-    return loop._replace(times=times._replace(**longer))
+def _times(conditions: NetworkConditions) -> dict[str, fmpq]:
+    """Return the least times of a loop under some conditions."""
+    wanted = {"delay": conditions.delay_s, "age": conditions.hold_s, "start": conditions.start_s}
+    return {name: fmpq(round(t_s * NS_PER_S), NS_PER_S) for name, t_s in wanted.items()}

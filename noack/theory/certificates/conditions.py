@@ -204,6 +204,8 @@ def kept_probability(
 def about_reference(resolved: Scenario, late_periods: int = 0, *, hold_s: float | None = None) -> Scenario:
     """Return the loop in the coordinates around its reference or set-point, which is 0 there.
 
+    An observer's first estimate is moved, too: its error is the same.
+
     ``hold_s``: the largest age of u_r in a held input; by default that with a lateness of
     ``late_periods`` steps.
     """
@@ -214,13 +216,22 @@ def about_reference(resolved: Scenario, late_periods: int = 0, *, hold_s: float 
     if hold_s is None:
         hold_s = nominal_conditions(resolved, late_periods).hold_s
     pushes = reference_pushes(resolved, hold_s)
+    x_r, observer = loop.reference.state(0), resolved.observer
     update = {
-        "initial_state": tuple((loop.x0 - loop.reference.state(0)).tolist()),
+        "initial_state": tuple((loop.x0 - x_r).tolist()),
         "disturbances": (*plant.disturbances, *pushes),
     }
+    if observer is not None and (
+        resolved.network.initial_sync == "first_packet" or observer.initial_estimate
+    ):
+        estimate = (
+            np.zeros(loop.n) if observer.initial_estimate is None else np.array(observer.initial_estimate)
+        )
+        observer = observer.model_copy(update={"initial_estimate": tuple((estimate - x_r).tolist())})
     return resolved.model_copy(
         update={
             "plant": plant.model_copy(update=update),
+            "observer": observer,
             "controller": resolved.controller.model_copy(update={"setpoint": None, "reference": None}),
         }
     )

@@ -17,8 +17,6 @@ from noack.theory.bounds.disturbances import excluded_probability
 from noack.theory.bounds.reference_limits import ReferenceLimits
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, REGION, first_input_ns, nominal_conditions
 
-_ESTIMATE_NOT_KNOWN = "at a set-point the error of the observer's first estimate is not known"
-
 
 def refusal_under(
     conditions: NetworkConditions,
@@ -51,8 +49,8 @@ def refusal_under(
     if (why := refusal_of_steps(resolved)) is not None:
         return why
     if resolved.observer is not None:
-        if start_error or setpoint_of(resolved) is not None:
-            return f"controller.setpoint: {_ESTIMATE_NOT_KNOWN}"
+        if start_error:
+            return "controller.setpoint: with an observer, only where the first input is not wrong"
         if plants in (BOX, REGION):
             kind = resolved.observer.kind
             return f'observer.kind = "{kind}": its error is bounded for one plant only, not for a box'
@@ -138,13 +136,11 @@ def refusals_about_reference(resolved: Scenario, *, knows_inputs: bool = False) 
             "set-point"
         }
     x_r, u_r = setpoint
-    why = ""
-    if resolved.observer is not None:
-        why = _ESTIMATE_NOT_KNOWN
-    elif u_r.any() and not knows_inputs:
-        why = "the input is 0 until the first one arrives, and not the set-point's u_r ≠ 0"
-    if why:
-        return dict.fromkeys((OWN_PLANT, BOX), f"controller.setpoint: {why}")
+    if u_r.any() and not knows_inputs:
+        why = (
+            "controller.setpoint: the input is 0 until the first one arrives, and not the set-point's u_r ≠ 0"
+        )
+        return dict.fromkeys((OWN_PLANT, BOX), why)
     half_A, half_B = resolved.plant.uncertainty_A, resolved.plant.uncertainty_B
     moved = np.zeros(len(x_r)) if half_A is None else np.array(half_A) @ np.abs(x_r)
     moved = moved + (0.0 if half_B is None else np.array(half_B) @ np.abs(u_r))
@@ -158,14 +154,12 @@ def _refusals_of_moving(resolved: Scenario) -> Mapping[str, str]:
     if not resolved.coverage.is_linear:
         return {REGION: "controller.reference: the region of a nonlinear plant is one about 0"}
     start_s = nominal_conditions(resolved, resolved.certificate.late_periods).start_s
-    reference, why = loop_of(resolved).reference, ""
+    reference = loop_of(resolved).reference
     assert reference is not None
-    limits = ReferenceLimits(reference, resolved.timing.horizon_ns)
-    if resolved.observer is not None:
-        why = "with an observer the error of its first estimate is not known"
-    elif not limits.is_at_rest_until(start_s):
-        why = (
-            "the input is 0 until the first one arrives, and not u_r; begin the first piece after "
-            f"{start_s:g} s"
-        )
-    return dict.fromkeys((OWN_PLANT, BOX), f"controller.reference: {why}") if why else {}
+    if ReferenceLimits(reference, resolved.timing.horizon_ns).is_at_rest_until(start_s):
+        return {}
+    why = (
+        "controller.reference: the input is 0 until the first one arrives, and not u_r; begin the first "
+        f"piece after {start_s:g} s"
+    )
+    return dict.fromkeys((OWN_PLANT, BOX), why)

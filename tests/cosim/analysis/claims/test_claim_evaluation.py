@@ -12,7 +12,7 @@ import pytest
 from cosim.analysis.claims import claim_catalogue
 from cosim.analysis.claims.claim_catalogue import CLAIMS
 from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.analysis.claims.setpoint_deviations import start_error
+from cosim.analysis.claims.reference_deviations import start_error
 from cosim.analysis.summary.loops_over_time import loop_over_time
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.align import aligned_parts

@@ -1,4 +1,4 @@
-"""The record of a run in deviations from its set-point, and what its first inputs differ by.
+"""The record of a run in deviations from its reference or set-point, and what its first inputs differ by.
 
 At a set-point x_r certificates bound x − x_r, x_s − x_r, x_c − x_r and u − u_r. Until the plant
 applies the first input of the controller, u is 0 and not u_r: ‖u − Kx‖ is recorded, and the
