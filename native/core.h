@@ -58,7 +58,8 @@ typedef struct {
     double score;           /* of the packet before */
 } noack_stage_memory;
 
-/* A stage's state that all flows share; departure times lie in a ring. */
+/* A stage's state that all flows share: of a queue, whose departure times lie in a ring, or of a
+   link that is good or bad. */
 typedef struct {
     int64_t head, count;
     int64_t entry_ns;
@@ -78,7 +79,7 @@ typedef struct {
     /* of the packets that wait until the link is free, the place + 1; 0: none */
     int64_t first_waiting;
     int64_t waiting_count;
-} noack_queue;
+} noack_stage_state;
 
 /* A stored datagram that waits until the link is free; see native/network/waiting.c. */
 struct noack_waiting {
@@ -95,21 +96,21 @@ struct noack_link {
     int64_t *integers;
     double *reals;
     noack_window *windows;
-    int64_t recovery, mansd, limit, tracks;
+    int64_t recovery, mansd, limit, can_reorder;
     /* the stage that chooses which packet of its queue the link sends next; -1: none */
     int64_t scheduler;
 
     /* State */
-    int64_t rows;               /* flows that have room */
-    int64_t recent_width;       /* a power of 2, of mansd + 1 at least if it tracks */
-    int64_t loss_width;         /* a power of 2 */
-    noack_flow *flows;          /* (rows,) */
-    noack_stage_memory *memory; /* (rows, stage_count) */
-    int64_t *recent_ns;         /* (rows, recent_width) release times of the last packets */
-    int64_t *losses;            /* (rows, loss_width) numbers of losses so far, S */
-    noack_queue *queues;        /* (stage_count,) */
-    int64_t *departures_ns;     /* the rings of the queues */
-    int64_t in_flight;          /* delayed packets and copies */
+    int64_t rows;                    /* flows that have room */
+    int64_t recent_width;            /* a power of 2, of mansd + 1 at least if it can reorder */
+    int64_t loss_width;              /* a power of 2 */
+    noack_flow *flows;               /* (rows,) */
+    noack_stage_memory *memory;      /* (rows, stage_count) */
+    int64_t *recent_ns;              /* (rows, recent_width) release times of the last packets */
+    int64_t *losses;                 /* (rows, loss_width) numbers of losses so far, S */
+    noack_stage_state *stage_states; /* (stage_count,) */
+    int64_t *departures_ns;          /* the rings of the queues */
+    int64_t in_flight;               /* delayed packets and copies */
     noack_counters counters;
 };
 
@@ -130,8 +131,9 @@ stage_function apply_bernoulli, apply_four_state, apply_gilbert_elliott, apply_p
     apply_duplicate, apply_earliest_deadline, apply_maximum_error, apply_opportunities,
     apply_priority, apply_reorder, apply_replay, apply_schedule;
 
-/* Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost already or must pass. */
-static inline void refuse(noack_decision *decision, int64_t fate) {
+/* Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost already or must pass. What
+   becomes of its times and its datagram: keep_limit in link.c. */
+static inline void lose(noack_decision *decision, int64_t fate) {
     if (decision->fate != NOACK_DELIVERED)
         return;
     if (decision->must_pass)

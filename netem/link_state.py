@@ -55,7 +55,7 @@ class LinkState:
         self.decision: CData = ffi.new("noack_decision *")
         """The decision for the last packet, a ``noack_decision``; overwritten by the next."""
         numbers, _arrays = _link_numbers(settings, seed, name)
-        numbers.tracks |= any_order
+        numbers.can_reorder |= any_order
         numbers.rows = rows
         self.core: CData = new_handle("link", numbers)
         """The link, as the core's functions take it; valid as long as this object lives."""
@@ -76,9 +76,9 @@ class LinkState:
         return int(core.noack_link_in_flight(self.core))
 
     @property
-    def tracks(self) -> bool:
+    def can_reorder(self) -> bool:
         """Whether packets can be delivered out of order."""
-        return bool(core.noack_link_tracks(self.core))
+        return bool(core.noack_link_can_reorder(self.core))
 
     @property
     def counters(self) -> Counters:
@@ -168,7 +168,7 @@ def _link_numbers(
         "recovery": max(between, default=0),
         "mansd": -1 if settings.longest_burst is None else settings.longest_burst,
         "limit": settings.limit,
-        "tracks": any(impairment.delays for impairment in settings.impairments),
+        "can_reorder": any(impairment.delays for impairment in settings.impairments),
     })  # fmt: skip
     arrays = {
         "stages": _stage_array(keyed_stages),

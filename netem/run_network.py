@@ -34,28 +34,28 @@ class RunNetwork:
     """The network of a run: :meth:`drive` runs the core until the next housekeeping.
 
     Args:
-        resolved: the resolved scenario.
+        scenario: that of the run, which all loops share.
         loops: number of the run's loops; each datagram has the number of its loop.
     """
 
-    def __init__(self, resolved: Scenario, loops: int = 1) -> None:
+    def __init__(self, scenario: Scenario, loops: int = 1) -> None:
         self._loops = loops
         self._memory = RelayMemory(1, clients=loops, row_count=_ROWS)
         self._relay, clients = self._memory.core, self._memory.clients
         self._relay.loops = self._loops
         flows = np.arange(self._loops)
         clients["number"][flows] = clients["flow_row"][flows] = flows
-        network = resolved.network
+        network = scenario.network
         links = [(network.link_of(flow), link_name(flow)) for flow in network.flows]
         self._directions: list[RelayDirection] = []
         if len(links) == 1:  # the relay has two directions; nothing arrives in the second
             links.append((LinkSettings(), "none"))
         for number, (settings, name) in enumerate(links):
-            direction = RelayDirection(settings, resolved.seeds.loss, [name], self._relay.directions[number])
+            direction = RelayDirection(settings, scenario.seeds.loss, [name], self._relay.directions[number])
             for loop in range(self._loops):
                 direction.start_flow(loop, number * self._loops + loop)
             self._directions.append(direction)
-        self._schedule = ChangeSchedule(resolved, lambda scenario: scenario.network.link)
+        self._schedule = ChangeSchedule(scenario, lambda changed: changed.network.link)
         self._reached_ns = -1
 
     def open(
@@ -93,7 +93,8 @@ class RunNetwork:
         sends = (core.NOACK_LINK_SOCKET, core.NOACK_DESTINATION_NAME)
         for direction, destination, addressing in zip(self._directions, destinations, sends, strict=False):
             direction.set_server(destination, addressing)
-        self._directions[0].row.full = 1  # refuse other sources
+        # The kernel keeps other sources from connected sockets; what came before connect() is refused.
+        self._directions[0].row.full = 1
 
     def set_clock(self, clock: RunClock) -> None:
         """Read the time as this clock does."""

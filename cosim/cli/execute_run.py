@@ -14,7 +14,6 @@ from cosim.live.coordination.remote_access import ListenSettings
 from cosim.live.monitoring.run_observers import RunLog, RunObserver, log_end
 from cosim.live.monitoring.run_terminal import RunTerminal
 from cosim.record.run_directory import RunEnding, how_to_complete
-from noack.core.core_library import require_live_runs
 from noack.core.errors import PeerError
 from noack.protocol.roles import ROLES
 from noack.runtime.active_runs import active_runs
@@ -40,7 +39,7 @@ def run_processes(
     session: str | None = None,
     listening: ListenSettings | None = None,
 ) -> int:
-    """Run a scenario live; print its verdict and return the exit status.
+    """Run a scenario live, where this is possible; print its verdict and return the exit status.
 
     Args:
         loaded: the scenario.
@@ -54,7 +53,6 @@ def run_processes(
         session: name that the processes of the run share.
         listening: how processes on other hosts join.
     """
-    require_live_runs()
     ending = None
     if live:
         from cosim.output.viewer.rerun_program import require_viewer  # imports http.client and TLS

@@ -1,4 +1,8 @@
-"""The end of a run: its record completed, its summary, report and recording written."""
+"""The end of a run, live or simulated: its record completed, its summary, report and recording written.
+
+Read :func:`finalize` first. ``_evaluate_loops`` has what is found out about each loop; its claims are
+judged in ``cosim/analysis/claims/``, whose package lists the files in the order to read.
+"""
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -299,9 +303,9 @@ def _with_results(
 def _claim_results(claims: RunClaims, summary: LoopSummary) -> dict[str, Any]:
     longest = summary.longest_loss_burst
     if summary.unintended_losses:
-        longest = max(longest, int(claims.conditions["dropouts"] or 0))
+        longest = max(longest, int(claims.largest_observed["dropouts"] or 0))
     return {
-        "conditions": ConditionsPart(**claims.conditions),
+        "conditions": ConditionsPart(**claims.largest_observed),
         "allowed": _allowed(claims.allowed),
         "certified_for": _allowed(claims.certified_for),
         "claims": claims.evaluate(),

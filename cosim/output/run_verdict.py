@@ -231,14 +231,18 @@ def _if_broken(loop: LoopSummary) -> GuaranteeVerdict | None:
 
 
 def _if_kept(loop: LoopSummary) -> GuaranteeVerdict | None:
-    """Return what limits the guarantee that was kept; None if it was not checked to the end."""
+    """Return what limits the guarantee that was kept.
+
+    None if no certificate claims anything, or if some claims are void and no claim of a certificate held.
+    One certificate that held is enough: what is void besides is a limit.
+    """
     certified = [claim for claim in loop.claims if claim.is_certified]
     if not certified:
         return None
     coverage = "; ".join(filter(None, (_certified_times(loop), _end_of_certificates(loop))))
     if not (void := _void_claims(loop)):
         return GuaranteeVerdict(Tone.GOOD, 0.0, coverage)
-    if _without_certificate(loop) or not any(claim.verdict == "held" for claim in certified):
+    if not any(claim.verdict == "held" for claim in certified):
         return None
     limits = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {_reason(loop).why}"
     return GuaranteeVerdict(Tone.GOOD, 0.0, "; ".join(filter(None, (coverage, limits))))
@@ -268,7 +272,7 @@ def _void_claims(loop: LoopSummary) -> list[Claim]:
     return [claim for claim in loop.claims if claim.verdict == "void"]
 
 
-def _without_certificate(loop: LoopSummary) -> list[Claim]:
+def _void_if_none_held(loop: LoopSummary) -> list[Claim]:
     """Return the void claims of certificates, if no claim of a certificate held."""
     certified = [claim for claim in loop.claims if claim.is_certified]
     if any(claim.verdict == "held" for claim in certified):
@@ -278,7 +282,7 @@ def _without_certificate(loop: LoopSummary) -> list[Claim]:
 
 def _reason(loop: LoopSummary) -> GuaranteeVerdict:
     """Return from when on, and why, the first of the void claims of a loop cannot be checked."""
-    uncovered = _without_certificate(loop)
+    uncovered = _void_if_none_held(loop)
     # A certificate that covered the run for some time says more than one that does not exist.
     candidates = [claim for claim in uncovered if claim.has_bound] or uncovered or _void_claims(loop)
     # Of equal times, the certificate of the scenario's own plant gives the reason, as in noack certify.

@@ -6,7 +6,7 @@ void apply_bernoulli(packet *packet, const noack_stage *stage, noack_stage_memor
     double uniform[2];
     draw(packet, stage, 0, uniform);
     if (happens(chance, memory, uniform[0]))
-        refuse(packet->decision, NOACK_DROPPED);
+        lose(packet->decision, NOACK_DROPPED);
     if (chance->scored) /* for a delay that is correlated with loss */
         packet->flow->score =
             chance->correlation == 0.0 ? -noack_normal_score(uniform[0]) : memory->score;

@@ -11,5 +11,5 @@ void apply_blackout(packet *packet, const noack_stage *stage, noack_stage_memory
     int64_t count = (settings->end - settings->begin) / 2;
     int64_t place = first_above(times_ns, settings->begin + count, settings->end, now_ns);
     if (place < settings->end && times_ns[place - count] <= now_ns)
-        refuse(packet->decision, NOACK_BLACKED_OUT);
+        lose(packet->decision, NOACK_BLACKED_OUT);
 }

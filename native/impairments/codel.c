@@ -19,7 +19,7 @@
 #include "../core.h"
 
 /* The time at which the service of a newly arrived packet would begin. */
-static int64_t service_ns(const noack_queue *queue) {
+static int64_t service_ns(const noack_stage_state *queue) {
     return max_of(queue->entry_ns, queue->busy_until_ns);
 }
 
@@ -31,7 +31,7 @@ static int64_t control_law(const noack_bottleneck *settings, int64_t t_ns, int64
 /* Whether the law drops the newly arrived packet. */
 int codel_is_due(const noack_link *link, int64_t stage) {
     const noack_bottleneck *settings = &link->stages[stage].bottleneck;
-    noack_queue *queue = &link->queues[stage];
+    noack_stage_state *queue = &link->stage_states[stage];
     int64_t now_ns = service_ns(queue), sojourn_ns = now_ns - queue->entry_ns;
     int above_long_enough = 0;
     if (sojourn_ns < settings->target_ns || sojourn_ns <= settings->mtu_ns)
@@ -55,7 +55,7 @@ int codel_is_due(const noack_link *link, int64_t stage) {
 /* Drop the newly arrived packet: it keeps its place, and the law's state advances. */
 void codel_drop(noack_link *link, int64_t stage) {
     const noack_bottleneck *settings = &link->stages[stage].bottleneck;
-    noack_queue *queue = &link->queues[stage];
+    noack_stage_state *queue = &link->stage_states[stage];
     int64_t now_ns = service_ns(queue);
     queue_occupy(link, stage, now_ns);
     if (queue->dropping) {

@@ -10,17 +10,17 @@ enum { GOOD, BAD };
    was in the bad state, else 0, s = p/(p + r) and lambda = 1 - p - r. The power is computed by
    squaring, so that every machine has the same bits. */
 static void change_state(
-    const noack_gilbert_elliott *settings, noack_queue *channel, int64_t now_ns, double u) {
-    int64_t steps = max_of(floor_div(now_ns, settings->step_ns) - channel->step, 0);
-    channel->step += steps;
+    const noack_gilbert_elliott *settings, noack_stage_state *common, int64_t now_ns, double u) {
+    int64_t steps = max_of(floor_div(now_ns, settings->step_ns) - common->step, 0);
+    common->step += steps;
     double base = 1.0 - settings->good_to_bad - settings->bad_to_good, power = 1.0;
     for (; steps > 0; steps >>= 1) {
         if (steps & 1)
             power *= base;
         base *= base;
     }
-    double bad = settings->share_bad, before = channel->state == BAD ? 1.0 : 0.0;
-    channel->state = u < bad + (before - bad) * power ? BAD : GOOD;
+    double bad = settings->share_bad, before = common->state == BAD ? 1.0 : 0.0;
+    common->state = u < bad + (before - bad) * power ? BAD : GOOD;
 }
 
 /* If a delay is correlated with loss, the packet gets a score: the scores in the bad state are the
@@ -30,9 +30,9 @@ void apply_gilbert_elliott(packet *packet, const noack_stage *stage, noack_stage
     double uniform[2], other[2];
     draw(packet, stage, 0, uniform);
     if (settings->step_ns > 0) {
-        noack_queue *channel = &packet->link->queues[packet->stage];
-        change_state(settings, channel, packet->decision->arrival_ns, uniform[0]);
-        memory->state = channel->state;
+        noack_stage_state *common = &packet->link->stage_states[packet->stage];
+        change_state(settings, common, packet->decision->arrival_ns, uniform[0]);
+        memory->state = common->state;
     } else if (memory->state == BAD) {
         if (uniform[0] < settings->bad_to_good)
             memory->state = GOOD;
@@ -46,5 +46,5 @@ void apply_gilbert_elliott(packet *packet, const noack_stage *stage, noack_stage
             memory->state == BAD ? other[0] * bad : bad + other[0] * (1.0 - bad));
     }
     if (uniform[1] < (memory->state == BAD ? settings->loss_in_bad : settings->loss_in_good))
-        refuse(packet->decision, NOACK_DROPPED);
+        lose(packet->decision, NOACK_DROPPED);
 }

@@ -35,7 +35,7 @@ static int64_t opportunity_ns(
 
 /* Whether a packet may enter at now_ns; removes packets that are carried until then. */
 static int has_room(
-    const noack_stage *stage, noack_queue *queue, const int64_t *ring, int64_t line_bytes,
+    const noack_stage *stage, noack_stage_state *queue, const int64_t *ring, int64_t line_bytes,
     int64_t now_ns) {
     int64_t limit_bytes = stage->opportunities.queue_bytes, waiting_bytes = 0;
     queue->entry_ns = max_of(queue->entry_ns, now_ns);
@@ -51,7 +51,7 @@ static int has_room(
 
 /* Put a packet into the queue, after has_room; return its departure time. */
 static int64_t carry_packet(
-    const noack_stage *stage, const int64_t *times_ms, noack_queue *queue, int64_t *ring,
+    const noack_stage *stage, const int64_t *times_ms, noack_stage_state *queue, int64_t *ring,
     int64_t line_bytes) {
     const noack_opportunities *settings = &stage->opportunities;
     int64_t number;
@@ -89,12 +89,12 @@ void apply_opportunities(packet *packet, const noack_stage *stage, noack_stage_m
     noack_decision *decision = packet->decision;
     if (decision->fate != NOACK_DELIVERED)
         return;
-    noack_queue *queue = &packet->link->queues[packet->stage];
+    noack_stage_state *queue = &packet->link->stage_states[packet->stage];
     const int64_t *times_ms = packet->link->integers;
     int64_t *ring = packet->link->departures_ns;
     int64_t line_bytes = max_of(decision->size_bytes + stage->opportunities.overhead_bytes, 1);
     if (!has_room(stage, queue, ring, line_bytes, decision->release_ns))
-        refuse(decision, NOACK_OVERFLOWED);
+        lose(decision, NOACK_OVERFLOWED);
     if (decision->fate == NOACK_DELIVERED)
         decision->release_ns = carry_packet(stage, times_ms, queue, ring, line_bytes);
     if (decision->copy_ns == NOACK_NEVER_NS)

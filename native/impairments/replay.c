@@ -53,7 +53,7 @@ void apply_replay(packet *packet, const noack_stage *stage, noack_stage_memory *
             delay_ns = table[settings->begin + record % count];
     }
     if (delay_ns < 0) {
-        refuse(decision, NOACK_DROPPED);
+        lose(decision, NOACK_DROPPED);
         delay_ns = -1 - delay_ns;
     }
     decision->release_ns += delay_ns;

@@ -61,7 +61,7 @@ void apply_schedule(packet *packet, const noack_stage *stage, noack_stage_memory
         turns.count = firsts[row + 1] - firsts[row];
     }
     if (turns.count == 0 || !has_room(&turns, memory, decision->release_ns))
-        refuse(decision, NOACK_OVERFLOWED);
+        lose(decision, NOACK_OVERFLOWED);
     int leaves = decision->fate == NOACK_DELIVERED && turns.count > 0;
     if (leaves)
         decision->release_ns = take_turn(&turns, memory, decision->release_ns);

@@ -9,7 +9,7 @@
 int64_t noack_queue_enters(noack_link *link, int64_t stage, int64_t now_ns) {
     const noack_stage *settings = &link->stages[stage];
     const int64_t *ring_ns = link->departures_ns + settings->queue_begin;
-    noack_queue *queue = &link->queues[stage];
+    noack_stage_state *queue = &link->stage_states[stage];
     queue->entry_ns = max_of(queue->entry_ns, now_ns);
     while (queue->count > 0 && ring_ns[queue->head] <= queue->entry_ns) {
         queue->head = (queue->head + 1) % settings->queue_places;
@@ -23,7 +23,7 @@ int64_t noack_queue_enters(noack_link *link, int64_t stage, int64_t now_ns) {
    the oldest one of the ring has not left, at least as many packets wait as there are places. */
 void queue_occupy(noack_link *link, int64_t stage, int64_t until_ns) {
     const noack_stage *settings = &link->stages[stage];
-    noack_queue *queue = &link->queues[stage];
+    noack_stage_state *queue = &link->stage_states[stage];
     if (queue->count < settings->queue_places)
         queue->count++;
     else
@@ -35,7 +35,7 @@ void queue_occupy(noack_link *link, int64_t stage, int64_t until_ns) {
 /* Put a packet into the queue, after noack_queue_enters; return its departure time. */
 int64_t noack_queue_serve(noack_link *link, int64_t stage, int64_t size_bytes) {
     const noack_bottleneck *settings = &link->stages[stage].bottleneck;
-    noack_queue *queue = &link->queues[stage];
+    noack_stage_state *queue = &link->stage_states[stage];
     int64_t line_bytes = max_of(size_bytes + settings->overhead_bytes, 0);
     if (settings->cell_bytes > 0) {
         int64_t cells = (line_bytes + settings->cell_bytes - 1) / settings->cell_bytes;
@@ -62,10 +62,10 @@ void apply_tail_drop(packet *packet, const noack_stage *stage, noack_stage_memor
     if (decision->fate != NOACK_DELIVERED)
         return;
     if (!noack_queue_enters(link, number, decision->release_ns))
-        refuse(decision, NOACK_OVERFLOWED);
+        lose(decision, NOACK_OVERFLOWED);
     if (decision->fate == NOACK_DELIVERED) {
         if (has_law && codel_is_due(link, number))
-            refuse(decision, NOACK_OVERFLOWED);
+            lose(decision, NOACK_OVERFLOWED);
         if (decision->fate == NOACK_DELIVERED)
             decision->release_ns = noack_queue_serve(link, number, decision->size_bytes);
         else

@@ -22,7 +22,8 @@
 /* Whether the guarantee needs S. */
 int counts_losses(const noack_link *link) { return link->window_count > 0 || link->recovery > 0; }
 
-/* Whether the flow's next packet has to be delivered. */
+/* Whether the flow's next packet has to be delivered: it is the first one, of a link that delivers
+   it (in a run, that of the updates), or its loss would break a rule. */
 int64_t noack_must_pass(const noack_link *link, int64_t row) {
     const noack_flow *flow = &link->flows[row];
     if (flow->forced_first)

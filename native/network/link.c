@@ -1,10 +1,16 @@
 /* One direction of a link: decisions for arriving packets, and accounting of departures.
 
-   How a packet is lost: decide_for applies the stages of native/impairments/ in order. A stage, or
-   the limit of packets in flight, loses it by refuse (core.h), unless it must pass
-   (noack_must_pass). A packet that only arrives corrupted is lost, too. noack_settle finds that
-   out; it holds a packet back that would make too many earlier ones stale, and counts the
-   consecutive losses, which noack_must_pass compares with M - 1 for the next packet. */
+   How a packet is lost: the relay of a live run (native/relay/loop.c) or the channel of a simulated
+   one (channel.c) has received a datagram of a flow, and asks for a decision. decide_for applies
+   the stages of native/impairments/ in order, each to every packet, lost or not. A stage, or the
+   limit of packets in flight, loses it by lose (core.h), unless it must pass (noack_must_pass).
+   noack_settle completes the decision. A packet that only arrives corrupted is lost, too. One that
+   leaves before earlier ones makes these stale: they are lost as well, and it is held back if that
+   would break the guarantee. The consecutive losses up to it are what noack_must_pass compares with
+   M - 1 for the next packet.
+
+   A lost packet has no departure, so its datagram is passed on to nobody, and nobody is told. Those
+   that are corrupted or stale are sent; their receiver rejects them (native/wire.c). */
 #include <string.h>
 
 #include "../core.h"
@@ -34,7 +40,7 @@ static stage_function *const APPLY[NOACK_STAGE_KINDS] = {
 /* Decide as the user's network did; a packet that must pass leaves nevertheless. */
 static void apply_outcome(int64_t outcome_ns, noack_decision *decision) {
     if (outcome_ns < 0)
-        refuse(decision, NOACK_DROPPED);
+        lose(decision, NOACK_DROPPED);
     if (decision->fate == NOACK_DELIVERED)
         decision->release_ns = decision->arrival_ns + max_of(outcome_ns, 0);
     else
@@ -57,7 +63,7 @@ static void order_copies(noack_decision *decision) {
 static void keep_limit(int64_t free_places, noack_decision *decision) {
     int64_t now_ns = decision->arrival_ns;
     if (decision->release_ns > now_ns && free_places <= 0)
-        refuse(decision, NOACK_OVERFLOWED);
+        lose(decision, NOACK_OVERFLOWED);
     if (decision->fate != NOACK_DELIVERED) {
         decision->release_ns = decision->copy_ns = NOACK_NEVER_NS;
         decision->bit = decision->copy_bit = -1;
@@ -171,7 +177,7 @@ void noack_settle(noack_link *link, int64_t row, noack_decision *decision) {
             decision->fate = NOACK_CORRUPTED;
     }
     if (effective_ns != NOACK_NEVER_NS) {
-        if (link->tracks)
+        if (link->can_reorder)
             effective_ns = hold_back(link, row, decision, effective_ns);
         if (decision->loss_suppressed)
             decision->fate = NOACK_FORCED;
@@ -186,7 +192,7 @@ void noack_settle(noack_link *link, int64_t row, noack_decision *decision) {
         flow->longest_loss_burst = max_of(flow->longest_loss_burst, losses);
         counters->longest_loss_burst = max_of(counters->longest_loss_burst, losses);
     }
-    if (link->tracks && link->mansd >= 0)
+    if (link->can_reorder && link->mansd >= 0)
         link->recent_ns[row * link->recent_width + (packet & (link->recent_width - 1))] =
             effective_ns;
     note_outcome(link, row, packet, effective_ns == NOACK_NEVER_NS);

@@ -31,8 +31,8 @@ static int64_t rate_of(const noack_stage *stage) {
 static void change_queue(
     const noack_link *before, int64_t old_place, const noack_link *after, int64_t new_place) {
     const noack_stage *old = &before->stages[old_place], *new = &after->stages[new_place];
-    const noack_queue *queue = &before->queues[old_place];
-    noack_queue *new_queue = &after->queues[new_place];
+    const noack_stage_state *queue = &before->stage_states[old_place];
+    noack_stage_state *new_queue = &after->stage_states[new_place];
     int64_t count = min_of(queue->count, new->queue_places);
     int64_t first = queue->head + queue->count - count;
     for (int64_t k = 0; k < count; k++)
@@ -52,7 +52,7 @@ static void change_stage(const noack_link *before, const noack_link *after, int6
         return;
     int is_same_kind = stage->kind == before->stages[old_place].kind;
     if (is_same_kind)
-        after->queues[new_place] = before->queues[old_place];
+        after->stage_states[new_place] = before->stage_states[old_place];
     if (stage->queue_places > 0)
         change_queue(before, old_place, after, new_place);
     if (is_same_kind)
@@ -68,7 +68,7 @@ static void change_losses(const noack_link *before, const noack_link *after, int
     const int64_t *times_ns = before->recent_ns + row * before->recent_width;
     int64_t *losses = after->losses + row * after->loss_width;
     int64_t packets = flow->packets, new_mask = after->loss_width - 1, count;
-    int counted = counts_losses(before), listed = before->tracks && before->mansd >= 0;
+    int counted = counts_losses(before), listed = before->can_reorder && before->mansd >= 0;
     if (counted) {
         count = before->loss_width - 1;
         if (count == new_mask) {
@@ -112,7 +112,7 @@ static void change_releases(
     int64_t *times_ns = after->recent_ns + row * after->recent_width;
     const int64_t *old_times_ns = before->recent_ns + row * before->recent_width;
     int64_t recent_mask = after->recent_width - 1, kept_times = 0;
-    if (before->tracks && before->mansd >= 0)
+    if (before->can_reorder && before->mansd >= 0)
         kept_times = min_of(after->mansd, before->mansd) + 1;
     int64_t first_known = flow->packets - kept_times,
             first_lost = flow->packets - flow->consecutive_losses;
@@ -123,7 +123,7 @@ static void change_releases(
         else if (number < first_lost)
             times_ns[number & recent_mask] = 0;
     }
-    if (before->tracks
+    if (before->can_reorder
         && (!is_same_guarantee(before, after) || before->scheduler >= 0 || after->scheduler >= 0))
         flow->first_release_ns = max_of(flow->first_release_ns, latest_ns);
 }
@@ -133,7 +133,7 @@ int64_t noack_link_change(
     const char **wrong) {
     noack_link_settings changed = *settings;
     changed.rows = link->rows;
-    changed.tracks |= link->tracks;
+    changed.can_reorder |= link->can_reorder;
     noack_link *after = noack_link_new(&changed, wrong);
     if (after == NULL)
         return 0;
@@ -147,7 +147,7 @@ int64_t noack_link_change(
         flow->longest_loss_burst = 0;
         if (counts_losses(after))
             change_losses(link, after, row);
-        if (after->tracks)
+        if (after->can_reorder)
             change_releases(link, after, row, latest_ns[row]);
     }
     after->in_flight = link->in_flight;

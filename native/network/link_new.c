@@ -202,7 +202,7 @@ static void set_widths(noack_link *link) {
     int64_t longest = 0;
     for (int64_t i = 0; i < link->window_count; i++)
         longest = max_of(longest, link->windows[i].packets);
-    link->recent_width = link->tracks && link->mansd >= 0 ? power_above(link->mansd) : 1;
+    link->recent_width = link->can_reorder && link->mansd >= 0 ? power_above(link->mansd) : 1;
     link->loss_width = counts_losses(link)
                            ? power_above(max_of(longest + 1, link->mansd + link->recovery + 1))
                            : 1;
@@ -249,14 +249,14 @@ noack_link *noack_link_new(const noack_link_settings *settings, const char **wro
     link->recovery = settings->recovery;
     link->mansd = settings->mansd;
     link->limit = settings->limit;
-    link->tracks = settings->tracks;
+    link->can_reorder = settings->can_reorder;
     link->stages = copy_of(settings->stages, link->stage_count, sizeof *link->stages);
     link->integers = copy_of(settings->integers, settings->integer_count, sizeof *link->integers);
     link->reals = copy_of(settings->reals, settings->real_count, sizeof *link->reals);
     link->windows = copy_of(settings->windows, link->window_count, sizeof *link->windows);
-    link->queues = zeros(link->stage_count, sizeof *link->queues);
+    link->stage_states = zeros(link->stage_count, sizeof *link->stage_states);
     if (link->stages != NULL && link->integers != NULL && link->reals != NULL
-        && link->windows != NULL && link->queues != NULL) {
+        && link->windows != NULL && link->stage_states != NULL) {
         set_widths(link);
         link->departures_ns = zeros(place_queues(link), sizeof *link->departures_ns);
         if (link->departures_ns != NULL && add_rows(link, max_of(settings->rows, 1)))
@@ -270,8 +270,8 @@ void noack_link_free(noack_link *link) {
     if (link == NULL)
         return;
     void *const arrays[] = {
-        link->stages, link->integers,  link->reals,  link->windows, link->flows,
-        link->memory, link->recent_ns, link->losses, link->queues,  link->departures_ns,
+        link->stages, link->integers,  link->reals,  link->windows,      link->flows,
+        link->memory, link->recent_ns, link->losses, link->stage_states, link->departures_ns,
     };
     for (size_t i = 0; i < sizeof arrays / sizeof *arrays; i++)
         free(arrays[i]);
@@ -311,5 +311,5 @@ const noack_stage *noack_link_stages(const noack_link *link) { return link->stag
 const double *noack_link_reals(const noack_link *link) { return link->reals; }
 const noack_counters *noack_link_counters(const noack_link *link) { return &link->counters; }
 int64_t noack_link_rows(const noack_link *link) { return link->rows; }
-int64_t noack_link_tracks(const noack_link *link) { return link->tracks; }
+int64_t noack_link_can_reorder(const noack_link *link) { return link->can_reorder; }
 int64_t noack_link_in_flight(const noack_link *link) { return link->in_flight; }

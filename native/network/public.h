@@ -241,7 +241,7 @@ typedef struct {
     int64_t recovery;
     int64_t mansd;                 /* maximum of consecutive losses, M - 1; -1: none */
     int64_t limit;                 /* maximum number of packets delayed at once */
-    int64_t tracks;                /* 1: packets can be delivered out of order */
+    int64_t can_reorder;                /* 1: packets can be delivered out of order */
     int64_t rows;                  /* flows for which there is room at first */
 } noack_link_settings;
 
@@ -263,7 +263,7 @@ const noack_stage *noack_link_stages(const noack_link *link);
 const double *noack_link_reals(const noack_link *link);
 const noack_counters *noack_link_counters(const noack_link *link);
 int64_t noack_link_rows(const noack_link *link);
-int64_t noack_link_tracks(const noack_link *link);
+int64_t noack_link_can_reorder(const noack_link *link);
 int64_t noack_link_in_flight(const noack_link *link);
 
 /* Decide for a packet that arrives at now_ns; row is that of its flow. */

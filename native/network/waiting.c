@@ -49,7 +49,8 @@ static int64_t merge(noack_waiting *waiting, int64_t a, int64_t b) {
 }
 
 /* Give the waiting packet at a place a smaller key. */
-static void lower_key(noack_queue *queue, noack_waiting *waiting, int64_t place, int64_t key) {
+static void lower_key(
+    noack_stage_state *queue, noack_waiting *waiting, int64_t place, int64_t key) {
     noack_waiting *waiter = &waiting[place];
     waiter->key = key;
     if (waiter->parent == 0)
@@ -67,12 +68,12 @@ int64_t flow_table_entry(const packet *packet, const noack_stage *stage) {
 void enter_queue(packet *packet, int64_t key, int is_time) {
     noack_decision *decision = packet->decision;
     noack_link *link = packet->link;
-    noack_queue *queue = &link->queues[packet->stage];
+    noack_stage_state *queue = &link->stage_states[packet->stage];
     if (decision->fate != NOACK_DELIVERED)
         return;
     noack_queue_enters(link, packet->stage, decision->arrival_ns);
     if (queue->count + queue->waiting_count >= link->stages[packet->stage].queue_places)
-        refuse(decision, NOACK_OVERFLOWED);
+        lose(decision, NOACK_OVERFLOWED);
     if (decision->fate != NOACK_DELIVERED)
         return;
     int64_t begin_ns = max_of(queue->entry_ns, queue->busy_until_ns);
@@ -93,7 +94,7 @@ void complete_waiting_decision(noack_decision *decision) {
 void wait_for_link(
     noack_link *link, int64_t row, noack_waiting *waiting, int64_t place, int64_t order,
     const noack_decision *decision) {
-    noack_queue *queue = &link->queues[link->scheduler];
+    noack_stage_state *queue = &link->stage_states[link->scheduler];
     noack_flow *flow = &link->flows[row];
     int64_t earlier = flow->last_waiting, key = decision->key;
     waiting[place] = (noack_waiting){
@@ -120,7 +121,7 @@ void serve(
     int64_t *count) {
     if (link->scheduler < 0)
         return;
-    noack_queue *queue = &link->queues[link->scheduler];
+    noack_stage_state *queue = &link->stage_states[link->scheduler];
     while (queue->first_waiting != 0
            && (queue->busy_until_ns <= now_ns || link->in_flight == queue->waiting_count)) {
         int64_t place = queue->first_waiting - 1;

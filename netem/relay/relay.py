@@ -253,7 +253,7 @@ class Relay:
     def _stamp_arrivals(self, direction: int) -> None:
         """Enable arrival timestamps where datagrams are delayed: delays count from the arrival."""
         link = self._open_links[direction // 2]
-        if self._directions[direction].tracks and not isinstance(link, DeviceLink):
+        if self._directions[direction].can_reorder and not isinstance(link, DeviceLink):
             core.noack_relay_read_stamps(self._memory.core)
             if direction % 2 == 0:
                 stamp_arrivals(link.endpoint)

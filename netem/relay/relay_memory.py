@@ -127,7 +127,7 @@ class RelayDirection(LinkState):
 
     def _set_keeps(self) -> None:
         flips_bits = any(impairment.flips_bits for impairment in self.settings.impairments)
-        self.row.keeps = self.tracks or flips_bits
+        self.row.keeps = self.can_reorder or flips_bits
 
 
 def name_array(packed: bytes) -> Bytes:

@@ -60,7 +60,7 @@ class Fate(IntEnum):
     CORRUPTED = 3
     """Forwarded with a flipped bit."""
     OVERFLOWED = 4
-    """Dropped from a full queue."""
+    """Dropped by a queue, full or by the law of CoDel; by a schedule; or by the limit of delayed packets."""
     BLACKED_OUT = 5
     """Dropped during a blackout."""
 

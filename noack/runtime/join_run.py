@@ -24,7 +24,7 @@ from noack.runtime.command_line import DESCRIPTOR_ON_STDIN, Parser, Signals, rep
 from noack.runtime.connections.credentials import read_credentials
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.end_reasons import HORIZON
-from noack.runtime.run_descriptor import DEFAULT_SESSION, RunDescriptor, find_descriptor, loads
+from noack.runtime.run_descriptor import DEFAULT_SESSION, RunDescriptor, find_descriptor, parse_descriptor
 from noack.runtime.run_process import RunProcess, launcher_has_ended
 
 _RUNS = Path("runs")
@@ -123,7 +123,7 @@ def _exit_status(role: str, signals: Signals, *, as_json: bool) -> Iterator[None
 
 def _find_descriptor(role: str, session: str, signals: Signals) -> RunDescriptor:
     if os.environ.pop(DESCRIPTOR_ON_STDIN, None):
-        return loads(sys.stdin.buffer.readline().decode())
+        return parse_descriptor(sys.stdin.buffer.readline().decode())
     descriptor = _wait_for(
         lambda: find_descriptor(session),
         signals,

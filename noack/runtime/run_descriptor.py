@@ -76,7 +76,7 @@ def new_descriptor(access: RunAccess, scenario: Scenario) -> RunDescriptor:
     )
 
 
-def loads(text: str) -> RunDescriptor:
+def parse_descriptor(text: str) -> RunDescriptor:
     """Parse a run descriptor; raise CallerError if the text is not one."""
     try:
         return RunDescriptor.model_validate_json(text)
@@ -105,4 +105,4 @@ def find_descriptor(session: str) -> RunDescriptor | None:
     """Return the run descriptor published in a session by a recorder or launcher, or None."""
     require_name(session, "session")
     files = live_lock_files("", session)
-    return loads(files[0].content.decode()) if files else None
+    return parse_descriptor(files[0].content.decode()) if files else None

@@ -179,19 +179,19 @@ class RunProcess:
             enlarge_buffer(endpoint, min(size_bytes, _LARGEST_BUFFER_BYTES))
             yield endpoint
 
-    def run(self, driver: Driver, channel: CountingSockets, machine: Reconfigurable) -> None:
+    def run(self, driver: Driver, sockets: CountingSockets, machine: Reconfigurable) -> None:
         """Drive the machines to the horizon, hand over the remaining rows, and report.
 
         Args:
             driver: drives the machines of this process.
-            channel: its sockets, which are closed at the end.
+            sockets: its sockets, which are closed at the end.
             machine: takes changes of settings.
         """
         telemetry = self._telemetry()
         reached_ns: int | None = None
         try:
-            reached_ns = self._drive(driver, channel, machine, telemetry)
-            channel.finish(self.clock.now_ns(), telemetry)
+            reached_ns = self._drive(driver, sockets, machine, telemetry)
+            sockets.finish(self.clock.now_ns(), telemetry)
         except BaseException as error:
             self.fail(error)
             raise
@@ -202,7 +202,7 @@ class RunProcess:
                 "pid": os.getpid(),
                 "ended": self.ended,
                 "realtime": self._realtime,
-                "channel": channel.report(),
+                "channel": sockets.report(),
                 "rows": telemetry.totals(),
                 "stored": telemetry.stored(),
                 "rows_by_loop": telemetry.totals_by_loop(),
@@ -211,7 +211,7 @@ class RunProcess:
             }
             if self.role in self._clocks:
                 self.report["clock"] = self._clocks[self.role].fields()
-            channel.close()
+            sockets.close()
             self._hand_over(telemetry)
 
     @cached_property
@@ -238,13 +238,13 @@ class RunProcess:
         )
 
     def _drive(
-        self, driver: Driver, channel: ProcessSockets, machine: Reconfigurable, telemetry: TelemetryBuffer
+        self, driver: Driver, sockets: ProcessSockets, machine: Reconfigurable, telemetry: TelemetryBuffer
     ) -> int:
         """Run the loop; return the simulated time up to which the machines have done their work."""
         limits = chain([None], repeat(_CHANGES_AT_ONCE))  # before the first step: all of them
         late_ns = run_loop(
             driver,
-            channel,
+            sockets,
             self.clock,
             telemetry,
             end_ns=self.resolved.end_ns,

@@ -137,9 +137,7 @@ def noise_with_loads(scenario: ScenarioTables) -> NoiseVariances:
 
 
 def loaded_model(model: ModelSection) -> ModelSection:
-    """Return a model with the states (x, d) in place of x, if it has a load."""
-    if model.load is None:
-        return model
+    """Return a model that has loads with the states (x, d) in place of x."""
     (A, B, K), (E, gain, _), k = model.trigger_matrices, load_gains(model), model.loads
     names = ("load",) if k == 1 else tuple(f"load_{number + 1}" for number in range(k))
     return model.model_copy(update={

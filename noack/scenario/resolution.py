@@ -311,7 +311,11 @@ def loop_named(scenario: Scenario, name: str | None) -> Scenario:
 
 
 def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
-    """Return the resolved scenarios of loops that differ in their names and seeds only."""
+    """Return the resolved scenarios of loops that differ in their names and seeds only.
+
+    Unknown loads (``loads.py``) and states of the controller (``controller_states.py``) become further
+    states of the model, if there are any; a reference becomes segments (``references.py``).
+    """
     scenario, plant = loops[0], loops[0].plant
     explicit = _explicit_model(scenario.model)
     is_drawn = (
@@ -320,7 +324,7 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
         or plant.draw in ("uniform", "vertex")
     )
     plants = [_resolved_plant(loop, explicit) for loop in (loops if is_drawn else loops[:1])]
-    model = loaded_model(explicit)
+    model = explicit if explicit.load is None else loaded_model(explicit)
     if scenario.mode == "model":
         A, B, K = np.array(model.A), np.array(model.B), np.array(model.gain)
         _require_finite("model", A + B @ K, K.T, scenario.timing.controller_period_ns)
@@ -336,10 +340,11 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
             section.model_copy(update={"row": (*output.row, *(0.0,) * (n - len(output.row)))})
             for section, output in zip(scenario.outputs, scenario.loop_outputs(), strict=True)
         )
-    return [
-        with_controller_states(loop.model_copy(update={**shared, "plant": own_plant}))
+    resolved = [
+        loop.model_copy(update={**shared, "plant": own_plant})
         for loop, own_plant in zip(loops, cycle(plants), strict=False)
     ]
+    return [*map(with_controller_states, resolved)] if scenario.controller.states else resolved
 
 
 def _resolved_plant(loop: Scenario, model: ModelSection) -> PlantSection:
@@ -387,10 +392,12 @@ def _explicit_model(model: ModelSection) -> ModelSection:
 
 
 def _controller(scenario: Scenario) -> ControllerSettings:
-    """Return the controller with its reference as segments."""
-    controller, segments = scenario.controller, scenario_segments(scenario)
-    if segments is None or isinstance((controller.reference or ())[0], FilePiece):
+    """Return the controller with its reference, if it has one, as segments."""
+    controller = scenario.controller
+    if controller.reference is None or isinstance(controller.reference[0], FilePiece):
         return controller  # the rows of a file stay, which are shorter
+    segments = scenario_segments(scenario)
+    assert segments is not None
     n = scenario.model.plant_states
     pieces = tuple(SolutionSegment.of(segment, n) for segment in segments)
     return controller.model_copy(update={"reference": pieces})

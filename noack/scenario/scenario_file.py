@@ -86,7 +86,7 @@ def network_of(path: Path) -> Table:
         raise CallerError(f"{path}: no table [network]; `noack measure TRACE --write FILE.toml` writes one")
     section = toml_file.validated(NetworkSection, table, f"{path}: network")
     for place, direction in section.directions.items():
-        _without_files(direction, path.parent, f"{path}: {place}")
+        _direction_contents(direction, path.parent, f"{path}: {place}")
     folder = path.absolute().parent
     return with_file_names(table, lambda name: str(folder / name))
 
@@ -136,6 +136,10 @@ def completed_with(
 def completed(content: ReadTable, path: Path, source: str | None = None) -> Scenario:
     """Validate parsed content and read the files that it names, relative to the scenario file.
 
+    Files of matrices and those of the loops are read before the validation, since they are part of what
+    is validated; those of losses, delays and references after it. The names of users' programs become
+    absolute; a link that must overflow is refused.
+
     ``source`` (by default the path) names the content in error messages: CallerError has one line
     per mistake.
     """
@@ -148,7 +152,7 @@ def completed(content: ReadTable, path: Path, source: str | None = None) -> Scen
         raise CallerError(f"{source}: not a scenario: {', '.join(LOOP_NEEDS)} are missing")
     content = with_matrices(content, path.parent, source)
     content = with_named_scenarios(content, path.parent, source)
-    return _with_files(validate(content, source), path, source)
+    return _with_contents_of_files(validate(content, source), path, source)
 
 
 def validate(content: ReadTable, source: str) -> Scenario:
@@ -156,11 +160,12 @@ def validate(content: ReadTable, source: str) -> Scenario:
     return toml_file.validated(Scenario, content, source)
 
 
-def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
+def _with_contents_of_files(scenario: Scenario, path: Path, source: str) -> Scenario:
+    """Return a valid scenario with the contents of the files that it still names, or their absolute names."""
     network = scenario.network
     update: dict[str, object] = {}
     for place, section in network.directions.items():
-        read = _without_files(section, path.parent, f"{source}: {place}")
+        read = _direction_contents(section, path.parent, f"{source}: {place}")
         _, _, key = place.partition(".")
         update |= {key: section.model_copy(update=read)} if key else read
     scenario = scenario.model_copy(update={"network": network.model_copy(update=update)})
@@ -200,7 +205,8 @@ def _with_reference(loop: Scenario, folder: Path, place: str) -> dict[str, Scena
     return {"controller": read}
 
 
-def _without_files(section: DirectionSection, folder: Path, place: str) -> Table:
+def _direction_contents(section: DirectionSection, folder: Path, place: str) -> Table:
+    """Return the loss and the impairments of a direction with the contents of their files."""
     impairments = tuple(
         impairment.without_files(folder, f"{place}.impairments.{number}")
         for number, impairment in enumerate(section.impairments)

@@ -469,11 +469,11 @@ class NetworkSection(DirectionSection):
     loss: Loss
     """Loss of updates, before the guarantee is applied."""
     enforce_mansd: bool = True
-    """false: the network ignores mansd and the constraints, to show the effect of a violated
-    assumption."""
+    """false: the network ignores mansd and the constraints of the updates, to show the effect of a
+    violated assumption; those of acknowledgements and actuations are enforced always."""
     initial_sync: Literal["first_packet", "known_state"] = "first_packet"
     """The means by which t_0 is delivered, as the paper assumes. first_packet: the network passes the
-    first packet of a flow. known_state: sensor and controller start from x(0)."""
+    first update of a loop. known_state: sensor and controller start from x(0)."""
     protocol: Literal["none", "ack"] = "none"
     """none: updates are not acknowledged, the paper's loop. ack: the baseline for comparison; the
     controller acknowledges each update, and x_s is reset only by an acknowledgement."""
@@ -536,7 +536,7 @@ class NetworkSection(DirectionSection):
     @property
     @cached_method
     def link(self) -> LinkSettings:
-        """The link from sensor to controller."""
+        """The link of the updates, which alone delivers a first packet, and may ignore the guarantee."""
         update: dict[str, object] = {"first_delivered": self.initial_sync == "first_packet"}
         if not self.enforce_mansd:
             update |= {"mansd": None, "constraints": ()}

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from noack.protocol.roles import LOOP_ROLES
-from noack.runtime.run_descriptor import RunDescriptor, loads
+from noack.runtime.run_descriptor import RunDescriptor, parse_descriptor
 from tests.helpers.live_runs import EPHEMERAL, Finished, start_commands
 from tests.helpers.two_hosts import TwoHosts
 from tests.helpers.waiting import PATIENCE_S, wait_for
@@ -47,7 +47,7 @@ class RunByHand:
         """Wait until the run has a descriptor; return it."""
         path = self._folder / f"noack-{os.getuid()}" / "default.json"
         self.wait(path.exists)
-        return loads(path.read_text())
+        return parse_descriptor(path.read_text())
 
     def wait(self, condition: Callable[[], bool]) -> None:
         """Wait for a condition; fail if the recording ends before."""

@@ -17,7 +17,7 @@ import pytest
 from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
 from noack.protocol.roles import LOOP_ROLES
-from noack.runtime.run_descriptor import loads
+from noack.runtime.run_descriptor import parse_descriptor
 from tests.helpers import live_runs as live
 
 Start = Callable[..., live.Running]
@@ -113,7 +113,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> ByHandRun:
             0o600,
             0o700,
         )
-        key = loads(descriptor.read_text()).key
+        key = parse_descriptor(descriptor.read_text()).key
         processes = early | {role: by_hand(role) for role in LOOP_ROLES[2:]}
         recording.wait_recording()
         twice = by_hand("sensor")

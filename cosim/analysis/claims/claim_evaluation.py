@@ -139,7 +139,7 @@ class _ClaimInstance(NamedTuple):
     """A claim about a run, by a certificate or without one."""
 
     claimed: ClaimDefinition
-    run: RunEvidence
+    evidence: RunEvidence
     """What it is checked against."""
     check: ClaimCheck
     curve: list[Envelope]
@@ -150,16 +150,16 @@ class _ClaimInstance(NamedTuple):
 
     def take(self, samples: Samples) -> None:
         """Check the next samples, and add to the curve, which is thinned if the run is long."""
-        run = self.run
-        bound, envelope = self.claimed.find(run, samples, self.certificate)
-        if run.facts.is_ever_bounded and bound is not None:
+        evidence = self.evidence
+        bound, envelope = self.claimed.find(evidence, samples, self.certificate)
+        if evidence.facts.is_ever_bounded and bound is not None:
             if self.outside is not None:
                 bound = bound._replace(void=VoidFrom(0.0, self.outside))
             self.check.add(bound)
         if envelope is None or (envelope.quantity == "inter_event" and self.curve):
             return  # the same line for all samples
         if envelope.quantity != "inter_event":
-            keep = decimate(envelope.t_s, envelope.values, run.record.slice_columns)
+            keep = decimate(envelope.t_s, envelope.values, evidence.record.slice_columns)
             envelope = envelope._replace(t_s=envelope.t_s[keep], values=envelope.values[keep])
         self.curve.append(envelope)
 
@@ -170,7 +170,8 @@ class RunClaims:
 
     record: RunRecord
     certificates: Sequence[ScenarioCertificate] | None = None
-    """Those of the run's scenario, if they are known."""
+    """Those of the run's scenario, if they are known. A run with a reference has others, about the
+    reference: they are computed here, with the witnesses that were found for these."""
     most_work: float = 0.0
     """Limit of the search for a witness; 0: only those are used that are known."""
 
@@ -194,7 +195,7 @@ class RunClaims:
 
     @cached_property
     def evidence(self) -> RunEvidence:
-        """What (I1) is checked against; certificates, too, if there is no set-point."""
+        """What (I1) is checked against; certificates, too, if there is no reference."""
         return self._evidence(self._checked_record, self.certificates)
 
     @cached_property
@@ -230,9 +231,9 @@ class RunClaims:
         return "_checked" in vars(self)
 
     @property
-    def conditions(self) -> dict[str, float | None]:
+    def largest_observed(self) -> dict[str, float | None]:
         """Largest observed value of each condition, over the whole run."""
-        return self.evidence.conditions
+        return self.evidence.largest_observed
 
     @property
     def allowed(self) -> NetworkConditions | None:
@@ -278,26 +279,28 @@ class RunClaims:
         for evidence in dict.fromkeys((self.certified_evidence, self.evidence)):
             for samples in evidence.samples():
                 for instance in instances:
-                    if instance.run is evidence:
+                    if instance.evidence is evidence:
                         instance.take(samples)
         return instances
 
     def _instances(self) -> Iterator[_ClaimInstance]:
         """Yield the claims of each certificate, and those that need none."""
-        run = self.certified_evidence
-        for certificate in run.certificates:
+        certified = self.certified_evidence
+        for certificate in certified.certificates:
             if not certificate.exists:
                 continue
-            outside = outside_box(run.record.scenario) if certificate.scope == BOX else None
-            for claim in (*output_claims(run, certificate), *CLAIMS):
+            outside = outside_box(certified.record.scenario) if certificate.scope == BOX else None
+            for claim in (*output_claims(certified, certificate), *CLAIMS):
                 if claim.is_certified:
                     proved = claim.is_proven(certificate)
-                    check = ClaimCheck(claim, certificate.source, run.until_s, proved=proved)
-                    yield _ClaimInstance(claim, run, check, [], certificate, outside)
+                    check = ClaimCheck(claim, certificate.source, certified.until_s, proved=proved)
+                    yield _ClaimInstance(claim, certified, check, [], certificate, outside)
         for claim in CLAIMS:
             if not claim.is_certified:
                 unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
-                evidence, until_s = (self.evidence, math.inf) if claim.to_the_end else (run, run.until_s)
+                evidence, until_s = (
+                    (self.evidence, math.inf) if claim.to_the_end else (certified, certified.until_s)
+                )
                 check = ClaimCheck(claim, claim.source, until_s, unmet)
                 yield _ClaimInstance(claim, evidence, check, [])
 
@@ -311,7 +314,7 @@ class RunClaims:
         envelopes = []
         for instance in self._checked:
             # Other bounds hold for deviations from a set-point.
-            if (curve := instance.curve) and (instance.run is self.evidence):
+            if (curve := instance.curve) and (instance.evidence is self.evidence):
                 t_s = np.concatenate([part.t_s for part in curve])
                 values = np.concatenate([part.values for part in curve])
                 whole = curve[0]._replace(t_s=t_s, values=values)

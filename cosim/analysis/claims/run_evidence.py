@@ -246,7 +246,7 @@ class RunEvidence:
         )
 
     @cached_property
-    def conditions(self) -> dict[str, float | None]:
+    def largest_observed(self) -> dict[str, float | None]:
         """Largest observed value of each condition."""
         return self.observed.summary()
 

@@ -311,6 +311,8 @@ def margin(
 
     if play and json:
         raise CallerError("--play: has an output of its own; leave out --json")
+    if play:
+        opt.require_linux()
     stops: list[StopRequestError] = []
     with status("examining") as change:
         result = find_margin(

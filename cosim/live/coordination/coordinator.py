@@ -212,7 +212,10 @@ class Coordinator:
             self.plane.refuse(query, f"cannot join: {error}")
 
     def _admit(self, role: str, query: zenoh.Query) -> None:
-        """Admit a process to the run; raise PeerError if it cannot join."""
+        """Admit a process to the run; raise PeerError if it cannot join.
+
+        Several of a role may be admitted: the first at the start barrier joins, the others are refused there.
+        """
         request = parse_message(AdmissionRequest, _payload(query))
         if role not in ROLES:
             raise PeerError("a run has no such process")

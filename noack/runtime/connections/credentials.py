@@ -16,7 +16,7 @@ from noack.core.errors import CallerError, NoAnswerError, PeerError, why
 from noack.core.file_access import open_regular
 from noack.protocol.roles import COORDINATOR, LOOP_ROLES
 from noack.runtime.address import Address, address_text, family_of
-from noack.runtime.run_descriptor import RunDescriptor, loads
+from noack.runtime.run_descriptor import RunDescriptor, parse_descriptor
 
 RUN_FILE = "run.json"
 CA_FILE, CERTIFICATE_FILE, KEY_FILE = "ca.pem", "certificate.pem", "private_key.pem"
@@ -107,7 +107,7 @@ def read_credentials(folder: Path, role: str, runs: Path) -> RunDescriptor:
     files = (RUN_FILE, CA_FILE, CERTIFICATE_FILE, KEY_FILE)
     content, *_ = [_private_content(folder / file) for file in files]
     try:
-        descriptor = loads(content.decode())
+        descriptor = parse_descriptor(content.decode())
     except (CallerError, UnicodeDecodeError) as error:
         raise CallerError(f"{folder / RUN_FILE}: not of `noack record --listen`: {error}") from None
     if descriptor.remote is None or descriptor.credentials_for != role:

@@ -68,7 +68,7 @@ class ProcessSockets(Protocol):
 
 def run_loop(
     driver: Driver,
-    channel: ProcessSockets,
+    sockets: ProcessSockets,
     clock: RunClock,
     telemetry: RecordSink,
     *,
@@ -96,13 +96,13 @@ def run_loop(
     turns = turns_done = 0
     driver.set_clock(clock)
     _pass_on(external_inputs(clock.now_ns()), telemetry)
-    channel.do_housekeeping(clock.now_ns(), telemetry)  # datagrams may have arrived before
+    sockets.do_housekeeping(clock.now_ns(), telemetry)  # datagrams may have arrived before
     while True:
         began_s, began_cpu_s = time.monotonic(), time.thread_time()
         driver.drive(clock.now_ns() + period_ns, telemetry)
         cpu_s = time.thread_time() - began_cpu_s
         is_overloaded = cpu_s > _OVERLOAD_SHARE * (time.monotonic() - began_s)
-        channel.do_housekeeping(clock.now_ns(), telemetry)
+        sockets.do_housekeeping(clock.now_ns(), telemetry)
         _pass_on(external_inputs(clock.now_ns()), telemetry)
         telemetry.flush()
         if is_overloaded:

@@ -46,7 +46,7 @@ def results(record: RunRecord) -> dict[str, Any]:
         "replay": replay(record).to_json(),
         "claims": [claim.model_dump(mode="json") for claim in claims.evaluate()],
         "violations": claims.violations(),
-        "conditions": claims.conditions,
+        "conditions": claims.largest_observed,
         "envelopes": [
             (curve.label, curve.t_s.tobytes(), curve.values.tobytes()) for curve in claims.envelopes()
         ],

@@ -71,7 +71,7 @@ def _settings(choices: Choices) -> tuple[Any, dict[str, Any]]:
         mansd=choices.choose((None, 0, 1, 5)),
     )
     link, arrays = _link_numbers(settings, 1, ("fuzz",))
-    link.tracks |= choices.below(4) == 1
+    link.can_reorder |= choices.below(4) == 1
     link.rows = 1 + choices.below(3)
     tables = {name: np.frombuffer(ffi.buffer(array), np.int64).copy() for name, array in arrays.items()}
     keys = tables["stages"].reshape(-1, ffi.sizeof("noack_stage") // 8)[:, 1:3]
@@ -101,7 +101,7 @@ def _allocate(link: Any, tables: dict[str, Words], arrays: Mapping[str, Any]) ->
     No check can know how much memory there is.
     """
     for name in _SCALARS:
-        if name != "tracks" and getattr(link, name) > _MOST:
+        if name != "can_reorder" and getattr(link, name) > _MOST:
             setattr(link, name, getattr(link, name) % 64)
     kept: dict[str, Any] = {}
     for name, words in tables.items():

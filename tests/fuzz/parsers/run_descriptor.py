@@ -37,8 +37,8 @@ def descriptor_input(choices: Choices) -> None:
     else:
         data = choices.near(SEEDS, WORDS)
     with refusal("not a valid run descriptor"):
-        descriptor = run_descriptor.loads(data.decode("utf-8", "replace"))
-        assert run_descriptor.loads(descriptor.model_dump_json()) == descriptor
+        descriptor = run_descriptor.parse_descriptor(data.decode("utf-8", "replace"))
+        assert run_descriptor.parse_descriptor(descriptor.model_dump_json()) == descriptor
         assert len(descriptor.key) == 32
         assert 0 <= descriptor.run_id < 2**64
         assert isinstance(descriptor.run_dir, str)

@@ -11,7 +11,13 @@ import pytest
 
 from noack.core.errors import CallerError
 from noack.runtime.private_folder import private_folder
-from noack.runtime.run_descriptor import descriptor_file, find_descriptor, loads, new_access, new_descriptor
+from noack.runtime.run_descriptor import (
+    descriptor_file,
+    find_descriptor,
+    new_access,
+    new_descriptor,
+    parse_descriptor,
+)
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 
@@ -38,7 +44,7 @@ def test_an_invalid_descriptor_gives_one_line_without_the_key(
     fields: dict[str, Any], key: str, value: object
 ) -> None:
     with pytest.raises(CallerError) as caught:
-        loads(json.dumps(fields | {key: value}))
+        parse_descriptor(json.dumps(fields | {key: value}))
     line = str(caught.value)
     assert line.startswith(f"not a valid run descriptor: {key}")
     assert "\n" not in line
@@ -50,7 +56,7 @@ def test_exactly_one_of_many_concurrent_runs_opens_a_session(
     fields: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_behind: bool
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    descriptor, at_once = loads(json.dumps(fields)), 8
+    descriptor, at_once = parse_descriptor(json.dumps(fields)), 8
     together = Barrier(at_once)
     if left_behind:  # left by a process that was killed
         with descriptor_file(descriptor, "lab") as path:
