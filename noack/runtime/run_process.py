@@ -79,7 +79,8 @@ class RunProcess:
         self.role = role
         self.descriptor = descriptor
         self.resolved = ResolvedRun(descriptor.scenario)
-        """All numbers of the run."""
+        """All numbers of the run. The descriptor's scenario has them; what is derived for the loops is
+        derived again when it is first used."""
         self.scenario = descriptor.scenario
         self.plane = plane
         self.updates = ParameterUpdates(plane)

@@ -3,7 +3,7 @@
 What a certificate claims ends at the first change of a setting on which the certificate depends. The
 identity (I1) holds across changes, and is checked to the end of the run.
 
-Certificates bound deviations from the set-point; (I1) needs no such coordinates. The processes of a
+Certificates bound deviations from the reference; (I1) needs no such coordinates. The processes of a
 stopped run end some milliseconds apart: claims are checked up to the last time that all of them
 reached.
 """
@@ -170,8 +170,8 @@ class RunClaims:
 
     record: RunRecord
     certificates: Sequence[ScenarioCertificate] | None = None
-    """Those of the run's scenario, if they are known. A run with a reference has others, about the
-    reference: they are computed here, with the witnesses that were found for these."""
+    """Those of the run's scenario, if they are known. They are not those of a run with a reference, which
+    are about it: these are computed here, with the witnesses that were found for the others."""
     most_work: float = 0.0
     """Limit of the search for a witness; 0: only those are used that are known."""
 
@@ -196,7 +196,8 @@ class RunClaims:
     @cached_property
     def evidence(self) -> RunEvidence:
         """What (I1) is checked against; certificates, too, if there is no reference."""
-        return self._evidence(self._checked_record, self.certificates)
+        certificates = self.certificates if self._reference is None else ()
+        return self._evidence(self._checked_record, certificates)
 
     @cached_property
     def certified_evidence(self) -> RunEvidence:
@@ -274,7 +275,7 @@ class RunClaims:
 
     @cached_property
     def _checked(self) -> list[_ClaimInstance]:
-        """All claims, checked in one pass over the run; with a set-point, in one for each evidence."""
+        """All claims, checked in one pass over the run; with a reference, in one for each evidence."""
         instances = list(self._instances())
         for evidence in dict.fromkeys((self.certified_evidence, self.evidence)):
             for samples in evidence.samples():
@@ -313,7 +314,7 @@ class RunClaims:
             self.certificates = ()  # reading a finished run does not run the code of its plant
         envelopes = []
         for instance in self._checked:
-            # Other bounds hold for deviations from a set-point.
+            # Other bounds hold for deviations from a reference.
             if (curve := instance.curve) and (instance.evidence is self.evidence):
                 t_s = np.concatenate([part.t_s for part in curve])
                 values = np.concatenate([part.values for part in curve])

@@ -112,8 +112,8 @@ class RunEvidence:
     """The data of a run for checking claims; each property is computed once, when first used."""
 
     record: RunRecord
-    """That of the run; of a run with a set-point, in deviations from it; of a stopped run, up to its
-    common end."""
+    """That of the run; for certificates of a run with a reference, in deviations from it; of a stopped
+    run, up to its common end."""
     whole_record: RunRecord | None = None
     """That of the whole run, if it is another one."""
     until_s: float = math.inf

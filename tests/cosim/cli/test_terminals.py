@@ -97,8 +97,8 @@ import atexit, os, signal, sys
 for number in (signal.SIGINT, signal.SIGTERM):
     atexit.register(os.kill, os.getpid(), number)  # as from outside, when Python cleans up
 sys.argv = ["noack", "scenarios"]
-from cosim.cli.entry_point import run
-run()
+from cosim.cli import main
+main()
 """
     process = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, env=environment(),
