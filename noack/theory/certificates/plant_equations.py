@@ -40,9 +40,12 @@ def equations_of(resolved: Scenario) -> PlantSystem:
     Raises:
         NotEnclosedError: it has no equations that can be enclosed, or does not accept x = 0.
     """
-    loop, plant = loop_of(resolved), resolved.plant.system
+    loop, plant, model = loop_of(resolved), resolved.plant.system, resolved.model
     if not plant.has_equations:
         raise NotEnclosedError(f'a plant of kind "{plant.kind}" has no equations to enclose')
+    if model.states != model.plant_states:
+        whose = "a load" if model.load_states else "the controller"
+        raise NotEnclosedError(f"its equations have no enclosure with a state of {whose}")
     start = PlantStart(np.zeros(loop.n), loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
     try:
         return plant.system(start)

@@ -9,7 +9,9 @@ from scipy.integrate import solve_ivp
 from scipy.signal import StateSpace
 
 import noack
+from noack.plants.systems.traced_equations import NotEnclosedError
 from noack.scenario.resolution import loop_of, resolve
+from noack.theory.certificates.plant_equations import equations_of
 
 A, B, K = np.array([[0.0, 1.0], [0.0, -2.0]]), np.array([[0.0], [5.0]]), np.array([[-6.0, -1.2]])
 INTEGRAL = {"kind": "state_space", "A": [[0.0]], "B": [[1.0, 0.0]], "C": [[-8.0]]}
@@ -71,6 +73,19 @@ def test_a_plant_in_python_has_the_same_motion(tmp_path: Path) -> None:
     found = [np.array([run.samples()[f"x_{index}"] for index in (1, 2, 3)]) for run in runs]
     assert np.abs(found[0] - found[1]).max() < 1e-4  # within a step, x is taken to change linearly
     assert runs[1].replay().bit_exact
+
+
+def test_equations_that_accept_any_state_are_not_those_of_the_controller(tmp_path: Path) -> None:
+    """Called with (x, ξ) they return as many rates; that of ξ is another one."""
+    code = "class Any:\n    def derivative(self, t_s, z, u):\n        return -(z**3) - z + u[0]\n"
+    (tmp_path / "any.py").write_text(code)
+    system = {"kind": "python", "file": str(tmp_path / "any.py"), "name": "Any"}
+    controller = {"kind": "state_space", "A": [[-1.0]], "B": [[1.0]], "C": [[0.5]]}
+    model = {"A": [[-1.0]], "B": [[1.0]], "gain": [[-3.0]], "state_names": ["a"]}
+    loop = {**LOOP, "model": model, "plant": {"initial_state": [0.3], "system": system}}
+    with pytest.raises(NotEnclosedError, match="a state of the controller"):
+        equations_of(resolve(noack.load({**loop, "controller": controller})))
+    assert equations_of(resolve(noack.load({**loop, "controller": {"kind": "linear"}}))) is not None
 
 
 def test_it_is_certified_and_replayed() -> None:
