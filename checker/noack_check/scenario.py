@@ -291,6 +291,7 @@ def _start(resolved: Table, plants: _Plants, x_r: Sequence[float]) -> _Start:
         return {"start": x_0 - matrix([[value] for value in x_r])}
     if any(x_r):
         raise RefusedError("controller.setpoint: with model.load_states not covered")
+    _require_unknown_start(resolved, "model.load_states")  # loads are not known
     n = len(plants.A) - k
     if n < 1:
         raise RefusedError("model.load_states: not fewer than states")
@@ -748,7 +749,7 @@ def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | No
 
 
 def _require_unknown_start(resolved: Table, name: str) -> None:
-    """Require that the first update is sent at t = 0: else the test at this time may be an event."""
+    """Require that the first update is sent at t = 0: before it x is not known to sensor and controller."""
     if _value(_table(resolved, "network"), "network.initial_sync") == "known_state":
         raise RefusedError(f'{name}: with network.initial_sync = "known_state" not covered')
 

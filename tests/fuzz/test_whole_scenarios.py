@@ -4,12 +4,16 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from flint import arb
 
+from cosim.simulation.virtual_time import simulate_run
 from noack.core.errors import CallerError
 from noack.scenario.scenario_file import load
+from noack_check.proof import Bound, Proof
 from tests.fuzz.scenarios import __main__ as command
 from tests.fuzz.scenarios.check_draw import Checked, Checks, Contradiction, check_draw, fault_of_message
 from tests.fuzz.scenarios.draws import NEVER_DRAWN, draw, drawn_keys, schema_keys
+from tests.helpers.shipped import shipped
 
 SEED = 71
 DRAWS = [number for number in range(31) if number not in (18, 20, 26, 27)]
@@ -62,6 +66,18 @@ def test_the_command_prints_a_contradiction_with_its_file(
     )
     assert path.exists() == bool(status)
     assert f"{status} with a contradiction" in output
+
+
+def test_a_run_that_exceeds_a_proven_bound_is_a_contradiction(tmp_path: Path) -> None:
+    scenario = shipped("double_integrator", "horizon_s=2.0")
+    ending = simulate_run(scenario, tmp_path)
+    outputs = ("x", "x[0]", "y[1]", "e_s", "e_c")
+    for size, is_exceeded in ((10.0, False), (1e-4, True)):
+        checks = Checks(draw(SEED, 0), tmp_path, 60.0)
+        bounds = tuple(Bound(output, arb(size), arb(0), from_start=True) for output in outputs)
+        checks.compare(ending, Proof(arb(0), bounds, None, None, is_quiet=True))
+        found = [contradiction.what.partition(" =")[0] for contradiction in checks.contradictions]
+        assert found == [f"‖{output}‖" for output in outputs if is_exceeded]
 
 
 def test_a_step_that_raises_or_takes_too_long_is_a_contradiction(tmp_path: Path) -> None:

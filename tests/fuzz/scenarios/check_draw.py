@@ -24,14 +24,14 @@ from cosim.analysis.adversary import Objective, conditions_of, find_worst
 from cosim.analysis.certificates import certificates_of
 from cosim.analysis.explained_run.explain import explains
 from cosim.analysis.replay.run_replay import replay_run
-from cosim.analysis.witnesses import find_statement, resolved_content
+from cosim.analysis.witnesses import find_region_statement, find_statement, resolved_content
 from cosim.cli.scenario_check import check_scenario
 from cosim.live.finalize import finalize
 from cosim.record.run_directory import RunEnding
 from cosim.record.run_record import load_run
 from cosim.simulation.virtual_time import simulate_run
 from noack.core.errors import NoackError
-from noack.scenario.resolution import resolve, resolve_run, resolved_loops
+from noack.scenario.resolution import loop_of, resolve, resolve_run, resolved_loops
 from noack.scenario.scenario import Scenario, loops_by_entry
 from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -207,7 +207,10 @@ class Checks:
             proof = None
             with self.step(f"prove, {conditions}"):
                 content = resolved_content(resolved, resolved.certificate.late_periods)
-                statement = find_statement(content, "own", conditions)
+                if resolved.coverage.is_linear:
+                    statement = find_statement(content, "own", conditions)
+                else:
+                    statement = find_region_statement(resolved, content, conditions)
                 proof = statement.proof
                 self.refusals[f"prove: {statement.reason}"] += proof is None
             if proof is None:
@@ -215,20 +218,22 @@ class Checks:
             self.counts[f"proven, {conditions}"] += 1
             is_ideal = conditions == "ideal"
             if not is_ideal and ending is not None:
-                self._compare(ending, proof)
+                self.compare(ending, proof)
             is_attacked = isinstance(resolved.trigger, DecayingSettings) and resolved.coverage.is_undisturbed
-            if not is_ideal or is_attacked:
+            if resolved.coverage.is_linear and (not is_ideal or is_attacked):
                 certificate = with_proven_bounds(
                     certify(resolved, conditions_of(resolved, continuous=is_ideal)), proof, resolved
                 )
                 self._attack(resolved, continuous=is_ideal, certificate=certificate)
 
-    def _compare(self, ending: RunEnding, proof: Proof) -> None:
+    def compare(self, ending: RunEnding, proof: Proof) -> None:
         """Compare the states and errors of a run of one loop with what is proven."""
-        records = load_run(ending.run_dir).loops
+        records = [*load_run(ending.run_dir).loops]
         if len(records) > 1 or records[0].scenario.changes:
             return
-        for output, t_s, sizes in sizes_of(records[0]):
+        loop = loop_of(records[0].scenario)
+        rest = loop.rest if loop.reference is None else loop.reference.state(0)
+        for output, t_s, sizes in sizes_of(records[0], rest):
             limit = proven_limit(proof, output, t_s)
             if len(over := np.flatnonzero(sizes > limit * (1 + 1e-9) + 1e-12)):
                 at = over[0]

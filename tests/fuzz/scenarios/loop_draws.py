@@ -64,7 +64,7 @@ class Model(NamedTuple):
 def loop(of: Chances, *, acknowledged: bool) -> tuple[Table, Model]:
     """Return the tables of a loop, and its model."""
     if of.chance(0.1):
-        return _nonlinear(of)
+        return _own_equations(of, acknowledged=acknowledged) if of.flag() else _nonlinear(of)
     table, model = _model(of)
     content: Table = {"model": table}
     of.put(content, 0.3, "outputs", lambda: _outputs(of, model.n))
@@ -141,6 +141,67 @@ def _nonlinear(of: Chances) -> tuple[Table, Model]:
                  if key in shipped["trigger"]}  # fmt: skip
     content["trigger"] = threshold | {"policy": "decaying"}
     return content, model
+
+
+def _own_equations(of: Chances, *, acknowledged: bool) -> tuple[Table, Model]:
+    """Return a loop whose plant is a class with equations: those of a model, and other terms."""
+    model = _random_model(of)
+    while model.n > 3:
+        model = _random_model(of)
+    z, inputs = [f"z[{i}]" for i in range(model.n)], [f"u[{j}]" for j in range(model.m)]
+    if of.chance(0.3):
+        inputs = [f"np.clip({name}, -{of.size(1.0, 50.0)}, {of.size(1.0, 50.0)})" for name in inputs]
+    rates = []
+    for row in np.hstack([model.A, model.B]).tolist():
+        terms = [f"{factor} * {name}" for factor, name in zip(row, [*z, *inputs], strict=True)]
+        rates.append(" + ".join(terms) + "".join(_term(of, z) for _ in range(of.integer(0, 1))))
+    rates[0] += _term(of, z)
+    code = f"""import numpy as np
+
+class Own:
+    def derivative(self, t_s, z, u):
+        return [
+            {", ".join(rates)},
+        ]
+"""
+    names = {
+        key: [f"{key} {index}" for index in range(count)]
+        for key, count in zip("xu", model.B.shape, strict=True)
+    }
+    table: Table = {key: matrix.tolist() for key, matrix in zip(("A", "B", "gain"), model, strict=True)}
+    content: Table = {"model": table | {"state_names": names["x"], "input_names": names["u"]}}
+    content["plant"] = plant = _plant(of, model)
+    for key in ("draw", "A", "B", "file", "names", "uncertainty_A", "uncertainty_B"):
+        plant.pop(key, None)
+    plant["system"] = {"kind": "python", "file": of.file("own", ".py", code), "name": "Own"}
+    if of.chance(0.9):  # others are refused
+        kept = [each for each in plant.pop("disturbances", []) if each.get("at", "input") == "input"]
+        plant |= {"disturbances": kept} if kept else {}
+    plant["initial_state"] = of.row(model.n, 0.3)
+    of.put(content, 0.3, "outputs", lambda: _outputs(of, model.n))
+    of.put(content, 0.3, "mode", lambda: of.one_of("model", "zoh"))
+    content["trigger"] = trigger(of, model, _measured_s(plant))
+    of.put(content, 0.8, "controller", lambda: controller(of, model, plant, acknowledged=acknowledged))
+    if of.chance(0.15):
+        controller_states(of, model, content)
+    return content, model
+
+
+def _term(of: Chances, z: list[str]) -> str:
+    """Return a term that is 0 at 0 and not linear, with its sign."""
+    first, other, size = of.one_of(*z), of.one_of(*z), of.size(0.01, 0.5)
+    return of.one_of(
+        f" + {size} * (np.sin({first}) - {other})",
+        f" + {size} * (np.cos({first}) - 1)",
+        f" - {size} * np.tanh({first} / {of.size(0.01, 0.3)})",
+        f" - {size} * np.sign({first})",
+        f" - {size} * {first} ** 3",
+        f" - {size} * {first} * abs({other})",
+        f" + {size} * np.cos(t_s) * {first}",
+        f" + {size} * np.arctan({first} * {other})",
+        f" + {size} * (np.sqrt(np.maximum({first} + 4, 0)) - 2)",
+        f" + {size} * {first} / (2 + {other} ** 2)",
+    )
 
 
 _PARAMETERS = {"Pendulum": {"length_m": 1.01}, "KinematicCar": {"wheelbase_m": 2.62, "steering_s": 0.1}}

@@ -5,11 +5,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import scipy.linalg
 
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
-from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import Constants
@@ -27,19 +28,33 @@ def proven_limit(proof: Proof, output: str, t_s: Vector) -> Vector:
     return limit
 
 
-def sizes_of(record: RunRecord) -> Iterator[tuple[str, Vector, Vector]]:
-    """Yield x at the plant's steps, and e_s = x_s − x at the measurements: times and norms, (k,).
+def sizes_of(record: RunRecord, rest: Vector) -> Iterator[tuple[str, Vector, Vector]]:
+    """Yield x, its entries and the outputs at the plant's steps, e_s at measurements, e_c at steps.
 
-    The recorded norm is that of x_s minus what was measured or estimated.
+    Each with its times and sizes, (k,). ``rest``: (n,), from where x counts. The recorded norm of e_s is that
+    of x_s minus what was measured or estimated.
     """
     loop = loop_of(record.scenario)
     W = np.eye(loop.n) if loop.weight is None else loop.weight
-    steps, measured = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
-    x_r = 0.0 if loop.reference is None else loop.reference.state(0)
-    yield "x", steps["t_ns"] / NS_PER_S, np.linalg.norm(steps["x"] - x_r, axis=1)
+    steps, measured, ticks = record[PLANT_STEP], record[SENSOR_MEASUREMENT], record[CONTROLLER_STEP]
+    t_s, x = steps["t_ns"] / NS_PER_S, steps["x"] - rest
+    yield "x", t_s, np.linalg.norm(x, axis=1)
+    rows = {"x": np.eye(loop.n), "y": np.array([output.row for output in loop.outputs])}
+    for kind, C in rows.items():
+        for index, row in enumerate(C):
+            yield f"{kind}[{index}]", t_s, np.abs(x @ row)
     measured = measured[np.isin(measured["t_ns"], steps["t_ns"])]
-    x = steps["x"][np.searchsorted(steps["t_ns"], measured["t_ns"])]
-    yield "e_s", measured["t_ns"] / NS_PER_S, np.linalg.norm((measured["x_s"] - x) @ W.T, axis=1)
+    error = measured["x_s"] - steps["x"][np.searchsorted(steps["t_ns"], measured["t_ns"])]
+    yield "e_s", measured["t_ns"] / NS_PER_S, np.linalg.norm(error @ W.T, axis=1)
+    delivered = record[CONTROLLER_DELIVERY]["model_t_ns"]
+    if record.scenario.network.initial_sync != "known_state":  # before, x_c is not known
+        ticks = ticks[ticks["model_t_ns"] >= (delivered[0] if len(delivered) else np.inf)]
+    newest = np.searchsorted(ticks["model_t_ns"], steps["t_ns"], side="right") - 1
+    t_s, x, ticks = t_s[newest >= 0], x[newest >= 0], ticks[newest[newest >= 0]]
+    ages_s = t_s - ticks["model_t_ns"] / NS_PER_S  # x_c goes on from the newest tick
+    predictions = {age_s: scipy.linalg.expm(loop.H * age_s) for age_s in np.unique(ages_s)}
+    x_c = [predictions[age_s] @ state for age_s, state in zip(ages_s, ticks["x_c"] - rest, strict=True)]
+    yield "e_c", t_s, np.linalg.norm((np.array(x_c).reshape(x.shape) - x) @ W.T, axis=1)
 
 
 def with_proven_bounds(
