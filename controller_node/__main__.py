@@ -8,8 +8,8 @@ from noack.runtime.command_line import stoppable_imports
 with stoppable_imports():
     from controller_node.controller import controllers_of
     from noack.core.errors import ExitStatus
-    from noack.runtime.drivers.live_driver import run_machines
     from noack.runtime.join_run import join_run
+    from noack.runtime.run_process import run_machines
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:

@@ -7,8 +7,8 @@ from noack.runtime.command_line import stoppable_imports
 
 with stoppable_imports():
     from noack.core.errors import ExitStatus
-    from noack.runtime.drivers.live_driver import run_machines
     from noack.runtime.join_run import join_run
+    from noack.runtime.run_process import run_machines
     from plant_server.plant import plants_of
 
 

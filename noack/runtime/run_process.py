@@ -3,7 +3,8 @@
 It asks for admission, waits at the start barrier, runs its loop and reports. It ends at the
 horizon, on the coordinator's stop, when its launcher has ended, or on SIGINT and SIGTERM. Its rows
 go to the recorder, or else to the run directory's spool. Read ``join_run.py`` first, which gets the
-run descriptor, then :class:`RunProcess` from top to bottom.
+run descriptor, then :class:`RunProcess` from top to bottom. :func:`run_machines` is what the processes of
+plant, sensor and controller do in it; that of the network has a function of its own (``netem/__main__.py``).
 """
 
 import os
@@ -20,9 +21,22 @@ from typing import Protocol
 
 from noack.core.clock import NS_PER_S, RunClock, clock_identity
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
+from noack.machines.loop_machines import LoopMachines
 from noack.protocol.record_tables import OWNER
-from noack.protocol.roles import CHANGEABLE, LOOP_ROLES, RECORDER, WITH_DEADLINES, Notice, Record
-from noack.protocol.wire_format import Wire
+from noack.protocol.roles import (
+    CHANGEABLE,
+    ENDS,
+    LOOP_ROLES,
+    RECEIVES,
+    RECORDER,
+    SENDS,
+    WITH_DEADLINES,
+    Notice,
+    Record,
+    receiver_of,
+    sender_to,
+)
+from noack.protocol.wire_format import Flow, Wire
 from noack.runtime.active_runs import run_name
 from noack.runtime.address import Address
 from noack.runtime.command_line import Signals, print_to_stderr
@@ -37,6 +51,7 @@ from noack.runtime.control_messages import (
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates
+from noack.runtime.drivers.live_driver import LiveDriver, LoopSockets
 from noack.runtime.drivers.real_time_loop import Driver, ProcessSockets, run_loop
 from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.end_reasons import HORIZON, LAUNCHER_GONE, LOST_AFTER_S
@@ -335,6 +350,35 @@ class RunProcess:
                 f"noack {self.role}: cannot reach `noack record`; rows are kept in {run_dir}/{SPOOL}; "
                 f"`noack summary {run_dir}` completes the record"
             )
+
+
+def run_machines(process: RunProcess, machines: LoopMachines) -> None:
+    """Join the run, drive the machines of all loops to the horizon, and report.
+
+    Raises:
+        CallerError: the process's port is taken.
+        PeerError: the run never started, or the system refused a socket for a peer.
+    """
+    driver = LiveDriver(
+        machines,
+        process.wire,
+        spin_ns=process.spin_ns,
+        coalescing_ns=process.coalescing_ns,
+    )
+    with process.open_socket() as endpoint:
+        addresses = process.join(endpoint.getsockname()[:2])
+        role, network = process.role, process.scenario.network.flows
+        answers, end = Flow.ACKNOWLEDGEMENT in network, ENDS[Flow.ACKNOWLEDGEMENT]
+        sockets = LoopSockets(
+            endpoint,
+            driver,
+            SENDS[role],
+            source=addresses[sender_to(role, RECEIVES[role], network)],
+            destination=addresses[receiver_of(role, SENDS[role], network)],
+            acknowledged_by=addresses["netem"] if answers and role == end.receiver else None,
+            acknowledges_to=addresses["netem"] if answers and role == end.sender else None,
+        )
+        process.run(driver, sockets, machines)
 
 
 def launcher_has_ended() -> bool:

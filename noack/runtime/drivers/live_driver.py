@@ -14,7 +14,6 @@ from contextlib import suppress
 from noack.core.clock import RunClock
 from noack.core.core_library import CData, core, ffi, new_handle
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.roles import ENDS, RECEIVES, SENDS, receiver_of, sender_to
 from noack.protocol.wire_format import (
     HEADER_BYTES,
     TAG_BYTES,
@@ -26,41 +25,11 @@ from noack.protocol.wire_format import (
 )
 from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.drivers.real_time_loop import RecordSink
-from noack.runtime.run_process import RunProcess
 from noack.runtime.udp_sockets import CountingSockets, errors_by_text
 
 _UDP_GRO = 104
 _AT_ONCE_NS = -(2**63)
 """Do what is due, and do not wait."""
-
-
-def run_machines(process: RunProcess, machines: LoopMachines) -> None:
-    """Join the run, drive the machines of all loops to the horizon, and report.
-
-    Raises:
-        CallerError: the process's port is taken.
-        PeerError: the run never started, or the system refused a socket for a peer.
-    """
-    driver = LiveDriver(
-        machines,
-        process.wire,
-        spin_ns=process.spin_ns,
-        coalescing_ns=process.coalescing_ns,
-    )
-    with process.open_socket() as endpoint:
-        addresses = process.join(endpoint.getsockname()[:2])
-        role, network = process.role, process.scenario.network.flows
-        answers, end = Flow.ACKNOWLEDGEMENT in network, ENDS[Flow.ACKNOWLEDGEMENT]
-        sockets = LoopSockets(
-            endpoint,
-            driver,
-            SENDS[role],
-            source=addresses[sender_to(role, RECEIVES[role], network)],
-            destination=addresses[receiver_of(role, SENDS[role], network)],
-            acknowledged_by=addresses["netem"] if answers and role == end.receiver else None,
-            acknowledges_to=addresses["netem"] if answers and role == end.sender else None,
-        )
-        process.run(driver, sockets, machines)
 
 
 def _raise_error(number: int) -> None:
