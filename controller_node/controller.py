@@ -5,7 +5,7 @@ explains them. :class:`LossCheck` compares the losses that the recorded rows sho
 guarantee.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,12 +14,19 @@ from numpy.typing import NDArray
 from noack.controllers.controller_settings import ControlFailedError, ControlLaw, ControlModel
 from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.clock import NEVER_NS, NS_PER_S
-from noack.core.core_library import CData, CoreMemory, core, reals_at
+from noack.core.core_library import CData, core, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.periods import Period
 from noack.core.references import Reference, ReferenceInForce
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
-from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
+from noack.machines.loop_machines import (
+    LoopMachines,
+    MachinePart,
+    Role,
+    TransitionMatrices,
+    parts_of,
+    take_changes,
+)
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP, RecordShape
 from noack.protocol.roles import FAILED, External, Notice
 from noack.protocol.wire_format import Flow
@@ -29,7 +36,6 @@ from noack.scenario.scenario import Scenario
 
 CONTROLLER = Role(
     "controller",
-    "noack_controller",
     Flow.UPDATE,
     (CONTROLLER_STEP, CONTROLLER_DELIVERY, None),
     CONTROLLER_SETTING,
@@ -199,50 +205,30 @@ class Controller(MachinePart):
         """The law, if another program has it."""
         return self.law if isinstance(self.law, External) else None
 
-    def fill(self, controller: CData, memory: CoreMemory) -> None:
-        """Fill a ``noack_controller`` at its start."""
-        n, m, period = len(self.H), self.inputs, self.period
-        self._memory = memory
-        set_machine(
-            controller.machine,
-            n=n,
-            m=m,
-            entries=n,
-            flow=Flow.UPDATE,
-            period=period,
-            horizon_ns=self.horizon_ns,
-        )
-        controller.machine.first_ns = self.first_ns
-        rests_ns = (length_ns - self.first_ns for length_ns in period.lengths_ns)
-        steps_ns = (*period.lengths_ns, self.first_ns, *rests_ns)
-        controller.model.transitions = memory.transitions(self.H, steps_ns)
-        self._in_force.reference.fill(controller.model.reference, memory)
+    def settings(self, models: TransitionMatrices) -> Mapping[str, object]:
+        """Return the fields of a ``noack_controller``."""
+        period, first_ns = self.period, self.first_ns
+        rests_ns = (length_ns - first_ns for length_ns in period.lengths_ns)
+        machine = {
+            "n": len(self.H), "m": self.inputs, "period": period.core, "first_ns": first_ns,
+            "horizon_ns": self.horizon_ns,
+        }  # fmt: skip
         K = self.law.K if isinstance(self.law, LinearFeedback) else None
-        memory.fill(
-            controller,
-            {
-                "K": np.zeros((m, n)) if K is None else K,
-                "safe_input": np.zeros(m) if self.safe_input is None else self.safe_input,
-                "is_user": K is None,
-                "acknowledges": self.acknowledges,
-                "predictions": self.predictions,
-                "timeout_ns": self.timeout_ns,
-                "holds_input": self.holds_input,
-                "carries_model": self.carries_model,
-                "x_c": np.zeros(n) if self.x0 is None else self.x0,
-                "has_state": self.x0 is not None,
-                "newest": core.NOACK_NO_SEQUENCE,
-                "x": np.zeros(n),
-                "u": np.zeros(m),
-                "scratch": np.zeros(3 * n + 2 * m),
+        return {
+            "machine": machine,
+            "model": {
+                "transitions": models.of(self.H, (*period.lengths_ns, first_ns, *rests_ns)),
+                "reference": self._in_force.reference.core,
             },
-        )
+            "K": K, "is_user": K is None, "safe_input": self.safe_input,
+            "acknowledges": self.acknowledges, "predictions": self.predictions,
+            "carries_model": self.carries_model, "timeout_ns": self.timeout_ns,
+            "holds_input": self.holds_input,
+        }  # fmt: skip
 
-    def set_drawn_values(self, controller: CData, memory: CoreMemory) -> None:
-        """Set what x(0) determines."""
-        self._memory = memory
-        if self.x0 is not None:
-            reals_at(controller.x_c, controller.machine.n)[:] = self.x0
+    def drawn_settings(self) -> Mapping[str, object]:
+        """Return what x(0) determines."""
+        return {"x_c": self.x0, "has_state": self.x0 is not None}
 
     def answer(self, question: int, controller: CData) -> Sequence[Notice]:
         """Apply changes, or call the user's control law."""
@@ -250,7 +236,7 @@ class Controller(MachinePart):
         if question == core.NOACK_ASK_CHANGE:
             for due in take_changes(self.schedule, controller.machine):
                 if self._in_force.change(due.since_ns, due.prepared):
-                    self._in_force.reference.fill(controller.model.reference, self._memory)
+                    controller.model.reference = self._in_force.reference.core
             return ()
         x, t_s = reals_at(controller.x, n).copy(), t_ns / NS_PER_S
         if question == core.NOACK_ASK_UPDATE:

@@ -48,6 +48,20 @@ void *copy_of(const void *elements, int64_t count, size_t size);
 /* Lengthen an array, to which `array` points, by zeros; return 0 if there is no memory. */
 int lengthen(void *array, int64_t before, int64_t after, size_t size);
 
+/* An array of a structure: where its pointer is, and how many numbers of 8 bytes it has. */
+enum { NEEDED, OPTIONAL, STATE }; /* one that is not given is missing, stays NULL, or is 0 */
+typedef struct {
+    void *pointer;
+    int64_t count;
+    int kind;
+} owned_array;
+
+/* Return a copy of a structure with copies of its arrays, in one piece of memory that is to be
+   freed; NULL if there is no memory, or if an array is missing, which is then what is wrong. */
+void *with_arrays(
+    void *structure, size_t size, const owned_array *arrays, int count, const char *missing,
+    const char **wrong);
+
 /* Zeros that begin at a cache line, in memory that is to be freed. */
 void *zeros_in_lines(int64_t count, size_t size, void **memory);
 
@@ -237,9 +251,6 @@ static inline void copy_datagram(noack_datagram *to, const noack_datagram *from)
 void noack_wire_header(const noack_wire *wire, const noack_message *message, uint8_t *header);
 int64_t noack_wire_examine_message(
     const noack_reception *reception, int64_t from_peer, const noack_message *message);
-
-/* loop/machine_check.c: NULL, or what is wrong with a rule whose times are at most most_ns. */
-const char *noack_check_rule(const noack_trigger_rule *rule, int64_t most_ns);
 
 /* link.c: decide by the stages, or, unless it is NULL, as the user's network did. */
 void decide_for(

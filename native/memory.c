@@ -14,6 +14,33 @@ void *copy_of(const void *elements, int64_t count, size_t size) {
     return copied;
 }
 
+void *with_arrays(
+    void *structure, size_t size, const owned_array *arrays, int count, const char *missing,
+    const char **wrong) {
+    const void *given;
+    size_t total = size;
+    for (int k = 0; k < count; k++) {
+        memcpy(&given, arrays[k].pointer, sizeof given);
+        if (given == NULL && arrays[k].kind == NEEDED) {
+            *wrong = missing;
+            return NULL;
+        }
+        total += (size_t)arrays[k].count * sizeof(double);
+    }
+    uint8_t *new = zeros(1, total), *next = new + size;
+    for (int k = 0; new != NULL && k < count; k++) {
+        size_t bytes = (size_t)arrays[k].count * sizeof(double);
+        memcpy(&given, arrays[k].pointer, sizeof given);
+        if (given == NULL && arrays[k].kind == OPTIONAL)
+            continue;
+        if (given != NULL)
+            memcpy(next, given, bytes);
+        memcpy(arrays[k].pointer, &next, sizeof next);
+        next += bytes;
+    }
+    return new == NULL ? NULL : memcpy(new, structure, size);
+}
+
 int lengthen(void *array, int64_t before, int64_t after, size_t size) {
     void *old, *new;
     memcpy(&old, array, sizeof old);

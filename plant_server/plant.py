@@ -19,7 +19,7 @@ applied. The policy then determines the input:
   and u is the safe input, so the input is the safe input. With zero-order hold (H = 0) it is u.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -27,13 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NEVER_NS, NS_PER_S
-from noack.core.core_library import CData, CoreMemory, core, reals_at
+from noack.core.core_library import CData, core, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise, product, transition
 from noack.core.periods import ANY_PERIOD, Period
 from noack.core.random_streams import normals, uniforms
-from noack.core.references import Reference
 from noack.disturbances.disturbance_settings import Place, SignalSource
-from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine
+from noack.machines.loop_machines import LoopMachines, MachinePart, Role, TransitionMatrices, parts_of
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import PlantStart, PlantSystem, SystemFailedError
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP, RecordShape
@@ -43,7 +42,7 @@ from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.sections import PlantSection
 
-PLANT = Role("plant", "noack_plant", Flow.ACTUATION, (PLANT_STEP, PLANT_ACTUATION, None))
+PLANT = Role("plant", Flow.ACTUATION, (PLANT_STEP, PLANT_ACTUATION, None))
 BLOCK = 256
 """Number of steps computed at once. A random value depends on its step's number only."""
 INPUT_NAMES = {"hold": "held", "zero": "0", "model": "the model's"}
@@ -114,21 +113,14 @@ class Watchdog:
         """Whether actuations carry the controller's model state."""
         return self.policy == "model"
 
-    def fill(self, plant: CData, memory: CoreMemory, period: Period) -> None:
-        """Fill the watchdog of a ``noack_plant`` with this step."""
-        memory.fill(
-            plant,
-            {
-                "watchdog": _POLICIES[self.policy],
-                "timeout_ns": self.timeout_ns,
-                "notice_ns": max(self.notice_ns, self.timeout_ns),
-                "carries_model": self.carries_model,
-                "K": self.K,
-            },
-        )
-        if self.H is not None and self.K is not None:
-            plant.fallback.transitions = memory.transitions(self.H, period.lengths_ns)
-            Reference.constant(*map(np.zeros, self.K.T.shape)).fill(plant.fallback.reference, memory)
+    def settings(self, models: TransitionMatrices, period: Period) -> Mapping[str, object]:
+        """Return the fields of a ``noack_plant`` with this step."""
+        model = None if self.H is None else models.of(self.H, period.lengths_ns)
+        return {
+            "watchdog": _POLICIES[self.policy], "timeout_ns": self.timeout_ns,
+            "notice_ns": max(self.notice_ns, self.timeout_ns), "carries_model": self.carries_model,
+            "K": self.K, "fallback": {"transitions": model},
+        }  # fmt: skip
 
 
 def too_old(t_ns: NDArray[np.int64], newest_ns: NDArray[np.int64], timeout_ns: int) -> NDArray[np.bool_]:
@@ -205,60 +197,38 @@ class Plant(MachinePart):
         """The system, if another program has it."""
         return self.system if isinstance(self.system, External) else None
 
-    def fill(self, plant: CData, memory: CoreMemory) -> None:
-        """Fill a ``noack_plant`` at time 0."""
-        n, m, shape = len(self.system.x), self.inputs, self.shape
-        set_machine(
-            plant.machine,
-            n=n,
-            m=m,
-            flow=Flow.ACTUATION,
-            entries=m * self.predictions + n * self.watchdog.carries_model,
-            period=self.period,
-            horizon_ns=self.horizon_ns,
-        )
-        # Its settings and its memory.
-        sources, reported = m + n * shape.disturbed_state, self.measure_every * self.reports_inputs
+    def settings(self, models: TransitionMatrices) -> Mapping[str, object]:
+        """Return the fields of a ``noack_plant``."""
+        machine = {
+            "n": len(self.system.x), "m": self.inputs, "period": self.period.core,
+            "horizon_ns": self.horizon_ns,
+        }  # fmt: skip
+        widths = (0, 0) if self.disturbance is None else self.disturbance.widths
         C = None if self.measurement is None else self.measurement.C
-        memory.fill(plant, {
-            "internal": shape.internal, "system": core.NOACK_USER, "sources": sources,
-            "C": C, "p": n if C is None else len(C),
+        outputs = len(self.system.x) if C is None else len(C)
+        noisy = self.measurement is not None and self.measurement.is_noisy
+        # No block of disturbances and noise has been drawn yet.
+        at_input, at_state, noise = (
+            {"width": width, "first": -BLOCK, "rows": BLOCK} for width in (*widths, outputs * noisy)
+        )
+        linear = isinstance(self.system, LinearSystem)
+        return {
+            "machine": machine, "internal": self.shape.internal, "C": C, "p": outputs,
+            "system": core.NOACK_LINEAR if linear else core.NOACK_USER,
             "measure_every": self.measure_every, "reports_inputs": self.reports_inputs,
             "predictions": self.predictions, "input_period": self.input_period.core,
-            "newest_sequence": NO_SEQUENCE, "fallback_sequence": NO_SEQUENCE, "missing_ns": -1,
-            "x": np.zeros(n), "z": np.zeros(shape.internal), "u": np.zeros(m),
-            "applied": np.zeros(sources), "recent_inputs": np.zeros((reported, m)),
-            "inputs": np.zeros((self.predictions, m)), "x_c": np.zeros(n),
-            "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
-        })  # fmt: skip
-        if isinstance(self.system, LinearSystem):
-            lengths = len(self.period.lengths_ns)
-            matrices = {"Ad": np.zeros((lengths, n, n)), "Bd": np.zeros((lengths, n, sources))}
-            memory.fill(plant, {"system": core.NOACK_LINEAR, **matrices})
-        self.set_drawn_values(plant, memory)
-        self.watchdog.fill(plant, memory, self.period)
-        # Disturbances and noise, of which no block has been drawn yet.
-        widths = (0, 0) if self.disturbance is None else self.disturbance.widths
-        noisy = self.measurement is not None and self.measurement.is_noisy
-        for name, width in (
-            ("at_input", widths[0]),
-            ("at_state", widths[1]),
-            ("noise", plant.p * noisy),
-        ):
-            signal = getattr(plant, name)
-            signal.width, signal.rows, signal.first = width, BLOCK, -BLOCK
-            signal.values = memory.zeros(BLOCK * width)
+            "at_input": at_input, "at_state": at_state, "noise": noise,
+            **self.watchdog.settings(models, self.period),
+        }  # fmt: skip
 
-    def set_drawn_values(self, plant: CData, memory: CoreMemory) -> None:
-        """Set the state, and the matrices of a linear system."""
-        n, system = plant.machine.n, self.system
-        reals_at(plant.x, n)[:], reals_at(plant.z, plant.internal)[:] = system.x, system.z
-        if isinstance(system, LinearSystem):
-            lengths_ns = self.period.lengths_ns
-            Ad = reals_at(plant.Ad, len(lengths_ns), n, n)
-            Bd = reals_at(plant.Bd, len(lengths_ns), n, plant.sources)
-            for place, length_ns in enumerate(lengths_ns):
-                Ad[place], Bd[place] = discretise(system.A, system.B, length_ns)
+    def drawn_settings(self) -> Mapping[str, object]:
+        """Return the state, and the matrices of a linear system."""
+        state: dict[str, object] = {"x": self.system.x, "z": self.system.z}
+        if not isinstance(self.system, LinearSystem):
+            return state
+        A, B = self.system.A, self.system.B
+        Ad, Bd = zip(*(discretise(A, B, length_ns) for length_ns in self.period.lengths_ns), strict=True)
+        return state | {"Ad": np.array(Ad), "Bd": np.array(Bd)}
 
     def answer(self, question: int, plant: CData) -> Sequence[Notice]:
         """Compute the disturbances and the noise of the next steps, or advance the system."""

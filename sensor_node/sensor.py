@@ -15,16 +15,23 @@ and corrected by y (native/loop/observer.c). If measurements are missing, the in
 are unknown, and the first known input is used.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
+from noack.core.core_library import CData, core, ffi, new_handle, new_structure, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.periods import Period
 from noack.core.references import Reference, ReferenceInForce
-from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
+from noack.machines.loop_machines import (
+    LoopMachines,
+    MachinePart,
+    Role,
+    TransitionMatrices,
+    parts_of,
+    take_changes,
+)
 from noack.observers.observer_settings import EstimationModel, ObserverSettings
 from noack.protocol.record_tables import (
     SENSOR_ACKNOWLEDGEMENT,
@@ -38,24 +45,14 @@ from noack.scenario.estimation import assumed_model
 from noack.scenario.parameter_changes import ChangeSchedule
 from noack.scenario.resolution import loop_of, policy_of, reference_of
 from noack.scenario.scenario import Scenario
-from noack.trigger_policies.trigger_rule import (
-    CodedPolicy,
-    EventTrigger,
-    Policy,
-    TriggerRule,
-    fill_rule,
-    rule_rows,
-)
+from noack.trigger_policies.trigger_rule import CodedPolicy, EventTrigger, Policy, TriggerRule, new_rule
 
 SENSOR = Role(
     "sensor",
-    "noack_sensor",
     Flow.MEASUREMENT,
     (None, SENSOR_MEASUREMENT, SENSOR_ACKNOWLEDGEMENT),
     SENSOR_SETTING,
 )
-_SENT_PLACES = 64
-"""Updates for which there is room at first while they wait for their acknowledgements."""
 _ANY_TIME_NS = 2**60
 """The latest horizon of a machine."""
 
@@ -85,11 +82,10 @@ class Observer:
         """Number of measured outputs."""
         return len(self.model.C)
 
-    def fill(self, sensor: CData, memory: CoreMemory) -> None:
-        """Fill the ``noack_observer`` of a sensor."""
-        self.settings.fill(sensor.observer, self.model, self.x, memory)
-        sensor.observer.t_ns = 0 if self.starts_from_x0 else -1
-        sensor.plant_period = self.period.core
+    def new(self) -> CData:
+        """Return a new ``noack_observer``."""
+        numbers = {"x": self.x, "t_ns": 0 if self.starts_from_x0 else -1, "reported": self.reported}
+        return self.settings.observer(self.model, numbers)
 
 
 @dataclass
@@ -134,7 +130,10 @@ class Sensor(MachinePart):
         if isinstance(self.policy, CodedPolicy):
             self._trigger = self.policy.new_trigger()
         self._in_force = ReferenceInForce(self.reference, len(self.H), self.inputs)
-        self._policy = self.policy  # also of a copy of another loop, which is not filled
+        self._policy = self.policy
+        self._handles: list[CData] = []
+        if self._trigger is not None and self.x0 is not None:
+            self._trigger.start(0, self._from_reference(0, self.x0))
 
     @property
     def shape(self) -> RecordShape:
@@ -150,60 +149,49 @@ class Sensor(MachinePart):
             inputs_reported=inputs_reported,
         )
 
-    def fill(self, sensor: CData, memory: CoreMemory) -> None:
-        """Fill a ``noack_sensor`` at its start."""
-        n, observer, period = len(self.H), self.observer, self.period
-        self._memory = memory
-        set_machine(
-            sensor.machine,
-            n=n,
-            m=self.inputs,
-            flow=Flow.MEASUREMENT,
-            entries=n if observer is None else observer.p + observer.reported,
-            horizon_ns=self.horizon_ns,
-        )
-        steps_ns = () if period is None else period.lengths_ns
-        sensor.model.transitions = memory.transitions(self.H, steps_ns)
-        self._in_force.reference.fill(sensor.model.reference, memory)
-        start = np.zeros(n) if self.x0 is None else self.x0
-        memory.fill(sensor, {
-            "is_user": self._trigger is not None, "acknowledged": self.timeout_ns is not None,
-            "timeout_ns": self.timeout_ns or 0, "has_state": self.x0 is not None,
-            "wait_ns": -1, "reports_error": self.reports_error,
-            "x_s": start, "event_x": np.zeros(n), "x": np.zeros(n), "e_s": np.zeros(n),
-        })  # fmt: skip
-        sensor.trigger.event_ns = -1
-        self._set_policy(sensor, self.policy)
-        sensor.trigger.auxiliary = sensor.rule.initial
-        if self.timeout_ns is not None:
-            self._make_room(sensor, _SENT_PLACES)
-        if observer is not None:
-            observer.fill(sensor, memory)
-        if self.x0 is not None:
-            self._start(sensor, 0, self.x0)
+    def settings(self, models: TransitionMatrices) -> Mapping[str, object]:
+        """Return the fields of a ``noack_sensor``."""
+        steps_ns = () if self.period is None else self.period.lengths_ns
+        settings: dict[str, object] = {
+            "machine": {"n": len(self.H), "m": self.inputs, "horizon_ns": self.horizon_ns},
+            "model": {
+                "transitions": models.of(self.H, steps_ns),
+                "reference": self._in_force.reference.core,
+            },
+            "rule": self._rule(self.policy), "is_user": self._trigger is not None,
+            "acknowledged": self.timeout_ns is not None, "timeout_ns": self.timeout_ns or 0,
+            "reports_error": self.reports_error,
+        }  # fmt: skip
+        return settings if self.observer is None else settings | {"plant_period": self.observer.period.core}
 
-    def set_drawn_values(self, sensor: CData, memory: CoreMemory) -> None:
-        """Set what x(0) determines."""
-        self._memory = memory
-        if self.observer is not None:
-            self.observer.fill(sensor, memory)
-        if self.x0 is not None:
-            reals_at(sensor.x_s, sensor.machine.n)[:] = self.x0
-            self._start(sensor, 0, self.x0)
+    def drawn_settings(self) -> Mapping[str, object]:
+        """Return what x(0) determines."""
+        start = {"x_s": self.x0, "has_state": self.x0 is not None}
+        return start if self.observer is None else start | {"observer": self._kept(self.observer.new())}
+
+    def _rule(self, policy: Policy) -> CData:
+        """Return the ``noack_trigger_rule`` of a policy; of code, its norm only."""
+        if isinstance(policy, CodedPolicy):
+            numbers = {"n": len(self.H), "weight": policy.weight}
+            return self._kept(new_handle("trigger_rule", new_structure("noack_trigger_rule", numbers)))
+        return self._kept(new_rule(policy, len(self.H)))
+
+    def _kept(self, handle: CData) -> CData:
+        """Keep a handle as long as this part, since sensors of the core may use it; return it."""
+        self._handles.append(handle)
+        return handle
 
     def answer(self, question: int, sensor: CData) -> Sequence[Notice]:
-        """Apply changes, let the user's trigger decide, or make room for sent updates."""
+        """Apply changes, or let the user's trigger decide."""
         if question == core.NOACK_ASK_CHANGE:
             for due in take_changes(self.schedule, sensor.machine):
                 assert due.prepared is not None
                 reference, policy = due.prepared
                 if self._in_force.change(due.since_ns, reference):
-                    self._in_force.reference.fill(sensor.model.reference, self._memory)
+                    sensor.model.reference = self._in_force.reference.core
                 if isinstance(policy, TriggerRule) and isinstance(self._policy, TriggerRule):
                     policy = policy.continuing(self._policy, due.since_ns)
                 self._set_policy(sensor, policy)
-        elif question == core.NOACK_ASK_ROOM:
-            self._make_room(sensor, 2 * sensor.sent_places)
         elif question == core.NOACK_ASK_RESTART:
             assert self._trigger is not None
             n = sensor.machine.n
@@ -212,6 +200,14 @@ class Sensor(MachinePart):
             assert question == core.NOACK_ASK_DECISION
             self._decide(sensor)
         return ()
+
+    def _set_policy(self, sensor: CData, policy: Policy) -> None:
+        """Set a policy as if it had been set at the last event."""
+        self._policy, sensor.rule = policy, self._rule(policy)
+        event_ns = sensor.trigger.event_ns
+        if self._trigger is None and event_ns >= 0:
+            state = ffi.addressof(sensor.trigger)
+            core.noack_trigger_condition(sensor.rule, state, event_ns, sensor.event_x)
 
     def _decide(self, sensor: CData) -> None:
         """Ask the user's trigger about a measurement."""
@@ -226,56 +222,9 @@ class Sensor(MachinePart):
             trigger.start(t_ns, x)
         sensor.event, sensor.left, sensor.right = decision
 
-    def _start(self, sensor: CData, t_ns: int, x: Vector) -> None:
-        """Restart the trigger's condition at an event at x, (n,)."""
-        x = self._from_reference(t_ns, x)
-        if self._trigger is not None:
-            self._trigger.start(t_ns, x)
-            return
-        n = sensor.machine.n
-        reals_at(sensor.event_x, n)[:] = x
-        core.noack_trigger_start(
-            ffi.addressof(sensor.rule),
-            ffi.addressof(sensor.trigger),
-            n,
-            t_ns,
-            sensor.event_x,
-            sensor.scratch,
-        )
-
     def _from_reference(self, t_ns: int, x: Vector) -> Vector:
         """Return x − x_r at a time, (n,), which a trigger compares with."""
         return self._in_force.difference(t_ns, x)
-
-    def _set_policy(self, sensor: CData, policy: Policy) -> None:
-        """Set a policy as if it had been set at the last event."""
-        self._policy = policy
-        n, memory = sensor.machine.n, self._memory
-        if isinstance(policy, CodedPolicy):
-            memory.fill(sensor.rule, {"weight": policy.weight})
-            sensor.scratch = memory.zeros(5 * n)
-            return
-        fill_rule(sensor.rule, policy, n, memory)
-        sensor.scratch = memory.zeros(5 * n + rule_rows(policy))
-        if sensor.trigger.event_ns >= 0:
-            core.noack_trigger_condition(
-                ffi.addressof(sensor.rule),
-                ffi.addressof(sensor.trigger),
-                n,
-                sensor.trigger.event_ns,
-                sensor.event_x,
-                sensor.scratch,
-            )
-
-    def _make_room(self, sensor: CData, places: int) -> None:
-        """Provide room for updates that wait for their acknowledgement."""
-        n, count = sensor.machine.n, sensor.sent_count
-        sent = self._memory.integers(np.zeros(places, np.int64))
-        x = self._memory.zeros(places * n)
-        if count:
-            ffi.memmove(sent, sensor.sent, 8 * count)
-            ffi.memmove(x, sensor.sent_x, 8 * n * count)
-        sensor.sent, sensor.sent_x, sensor.sent_places = sent, x, places
 
 
 def sensors_of(loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None) -> LoopMachines:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState, stream_names
-from noack.core.core_library import CData, CoreMemory, core, dtype_of, ffi, new_handle, pointer_to
+from noack.core.core_library import CData, core, dtype_of, ffi, new_handle, new_structure, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys
@@ -26,7 +26,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.theory.coverage import require_exact
-from noack.trigger_policies.trigger_rule import TriggerRule, fill_rule
+from noack.trigger_policies.trigger_rule import TriggerRule, new_rule
 
 ROW = dtype_of("noack_exact_row")
 """The row of a run: ``noack_exact_row`` of native/exact/public.h."""
@@ -107,18 +107,17 @@ class ExactSimulation:
         if max(n, m) > _MOST_ENTRIES:
             raise CallerError(f"plant: exact simulation has at most {_MOST_ENTRIES} states and inputs")
         self.n, self.m, self._link = n, m, link
-        settings, memory = ffi.new("noack_exact_settings *"), CoreMemory()
-        fill_rule(settings.rule, trigger, n, memory)
-        memory.fill(settings, {
-            "n": n, "m": m, "H": H, "K": K, "horizon_s": horizon_s, "known_start": known_start,
-            "most_events": 2**62, "fading_per_s": trigger.fading_per_s, "fading_until_s": np.inf,
-            **numbers,
+        self._rule = new_rule(trigger, n)
+        settings = new_structure("noack_exact_settings", {
+            "n": n, "m": m, "H": H, "K": K, "rule": self._rule, "horizon_s": horizon_s,
+            "known_start": known_start, "most_events": 2**62, "fading_per_s": trigger.fading_per_s,
+            "fading_until_s": np.inf, **numbers,
         })  # fmt: skip
         # The network: a link, or whether each update arrives.
         if link is not None:
             settings.link, settings.first_delivered = link.core, link.settings.first_delivered
         elif delivered is not None:
-            fates = memory.keep(np.array(delivered, np.uint8))
+            fates = np.array(delivered, np.uint8)
             settings.fate_count, settings.fates = len(fates), pointer_to(fates, "uint8_t *")
         self.core: CData = new_handle("exact", settings)
         """The simulation, as the core's functions take it."""

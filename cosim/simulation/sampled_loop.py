@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from noack.core.core_library import core, ffi, pointer_to
+from noack.core.core_library import core, ffi, new_handle, pointer_to, set_fields
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.scenario.estimation import assumed_model
@@ -117,30 +117,21 @@ class SampledLoop:
         self._set_disturbances(state_increments(resolved), noise_of(resolved))
 
     def _set_disturbances(self, increments: Matrix, noise: Matrix) -> None:
-        """Make a plant with these disturbances and noise; it shares the state of the first one."""
-        matrices, (n, m) = self.matrices, self.resolved.model.dimensions
+        """Make a plant with these disturbances and noise."""
+        matrices, n = self.matrices, self.matrices.n
         self._increments, self._noise = increments, noise
-        plant = ffi.new("noack_plant *", self._machines[0].machines[0])
         lengths_ns = self.resolved.timing.plant_period.lengths_ns
         sources = np.array([discretise(matrices.A, matrices.B, length)[1] for length in lengths_ns])
         at_state = np.zeros((self.last + 1, n))
         if len(increments):
             at_state[: len(increments)] = increments
             sources = np.array([np.hstack([B, np.eye(n)]) for B in sources])
-        arrays = {"Bd": _dense(sources), "applied": np.zeros(m + n)}
-        for name, array in arrays.items():
-            setattr(plant, name, pointer_to(array, "double *"))
-        plant.sources, plant.at_input.width = sources.shape[2], 0
-        noises = _dense(noise)
-        for signal, values, count in (
-            (plant.at_state, at_state, len(increments)),
-            (plant.noise, noises, len(noise)),
-        ):
-            signal.width = values.shape[1] if count else 0
-            signal.first, signal.rows = 0, len(values)
-            signal.values = pointer_to(values, "double *")
-        self._plant = plant
-        self._keep_alive = (arrays, at_state, noises)  # arrays that the core points to
+        settings = ffi.new("noack_plant *", self._machines[0].machines[0][0])
+        set_fields(settings, {"Bd": sources, "applied": None, "at_input": {"width": 0, "values": None}})
+        for name, values, count in (("at_state", at_state, len(increments)), ("noise", noise, len(noise))):
+            signal = {"width": values.shape[1] if count else 0, "rows": len(values), "first": 0}
+            set_fields(settings, {name: signal | {"values": values}})
+        self._plant = new_handle("plant", settings)
 
     @property
     def known_start(self) -> bool:
@@ -227,8 +218,8 @@ class SampledLoop:
         weight = _dense(scales.weight)
         levels = [_dense(level) for level in (scales.error, scales.state)]
         segments = ffi.new("noack_segments *", {
-            "plant": self._plant, "sensor": ffi.addressof(sensor),
-            "controller": ffi.addressof(controller), "last": self.last, "delay_ns": self.delay_ns,
+            "plant": self._plant, "sensor": sensor, "controller": controller,
+            "last": self.last, "delay_ns": self.delay_ns,
             "known_start": self.known_start, "runs": len(runs.step),
             "places": runs.sent.shape[1], "weight": pointer_to(weight, "double *"),
             "gains": pointer_to(self._gains, "double *") if len(self._gains) else ffi.NULL,

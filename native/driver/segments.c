@@ -19,6 +19,7 @@ static int covers(const noack_signal *signal, int64_t last) {
 const char *noack_segments_check(const noack_segments *segments) {
     const noack_plant *plant = segments->plant;
     const noack_machine *machine = &plant->machine;
+    const noack_observer *observer = segments->sensor->observer;
     if (plant->system != NOACK_LINEAR || plant->predictions != 1 || plant->carries_model
         || segments->sensor->is_user || segments->sensor->acknowledged
         || segments->controller->is_user || segments->controller->acknowledges
@@ -32,8 +33,8 @@ const char *noack_segments_check(const noack_segments *segments) {
     if (!covers(&plant->at_state, segments->last) || plant->at_input.width > 0
         || !covers(&plant->noise, segments->last / plant->measure_every))
         return "disturbances or noise end before the last step";
-    if ((segments->sensor->observer.kind != NOACK_NO_OBSERVER) != (segments->gains != NULL)
-        || segments->sensor->observer.kind == NOACK_KALMAN)
+    if ((observer != NULL) != (segments->gains != NULL)
+        || (observer != NULL && observer->kind == NOACK_KALMAN))
         return "an observer needs its gain at each measurement";
     return NULL;
 }
@@ -70,10 +71,10 @@ static void load(noack_segments *segments, int64_t run) {
     sensor->model_ns = t_ns;
     sensor->has_state = 1;
     sensor->trigger.auxiliary = segments->auxiliary[run];
-    noack_trigger_start(&sensor->rule, &sensor->trigger, n, t_ns, sensor->x_s, sensor->scratch + n);
+    noack_trigger_start(sensor->rule, &sensor->trigger, t_ns, sensor->x_s);
     if (segments->gains != NULL) {
-        copy(n, segments->y + run * n, sensor->observer.x);
-        sensor->observer.t_ns =
+        copy(n, segments->y + run * n, sensor->observer->x);
+        sensor->observer->t_ns =
             step < 0 ? -1 : time_of_tick_ns(&plant->machine, step - step % measure_every);
     }
     copy(n, segments->x_c + run * n, controller->x_c);
@@ -155,8 +156,8 @@ static int64_t measure(
     int64_t n = sensor->machine.n, measurement = step / segments->plant->measure_every;
     double error[NOACK_MAX_ENTRIES], image[NOACK_MAX_ENTRIES];
     if (segments->gains != NULL)
-        sensor->observer.gain =
-            (double *)segments->gains + measurement * n * sensor->observer.p; /* not written */
+        sensor->observer->gain =
+            (double *)segments->gains + measurement * n * sensor->observer->p; /* not written */
     noack_message message;
     copy_message(&message, &output->message);
     int64_t (*ask)(int64_t, int64_t) = sensor->machine.ask;

@@ -84,7 +84,7 @@ static int64_t blocks_of(const noack_trigger_rule *rule, const exact_code *code)
 
 /* Whether the rule compares |W e_s|, or its integral. */
 static int is_plain(const noack_exact_settings *exact) {
-    const noack_trigger_rule *rule = &exact->rule;
+    const noack_trigger_rule *rule = exact->rule;
     int64_t n = exact->n;
     if (rule->positive_rows != n || rule->negative_rows != 0)
         return 0;
@@ -98,7 +98,7 @@ static int is_plain(const noack_exact_settings *exact) {
 }
 
 static int is_quadratic(const noack_exact_settings *exact) {
-    const noack_trigger_rule *rule = &exact->rule;
+    const noack_trigger_rule *rule = exact->rule;
     return rule->positive_rows > 0
            && (!is_plain(exact) || rule->is_dynamic || rule->from_event || rule->grid_ns > 0);
 }
@@ -106,10 +106,9 @@ static int is_quadratic(const noack_exact_settings *exact) {
 static int is_finite_nonnegative(double number) { return number >= 0.0 && number < INFINITY; }
 
 static const char *check_exact_rule(const noack_exact_settings *exact) {
-    const noack_trigger_rule *rule = &exact->rule;
-    const char *wrong = noack_check_rule(rule, NEVER_NS);
-    if (wrong != NULL)
-        return wrong;
+    const noack_trigger_rule *rule = exact->rule;
+    if (rule == NULL || rule->n != exact->n)
+        return "a simulation has no rule of its size";
     if (!is_finite_nonnegative(rule->level) || !is_finite_nonnegative(rule->rate_per_s)
         || !is_finite_nonnegative(rule->floor) || !is_finite_nonnegative(rule->decay_per_s))
         return "a trigger rule has a threshold or a rate below 0";
@@ -198,7 +197,7 @@ static int64_t scratch_length(const noack_trigger_rule *rule, const exact_code *
 static void lay_out(
     const noack_exact_settings *exact, const exact_code *code, double *begin,
     exact_memory *memory) {
-    const noack_trigger_rule *rule = &exact->rule;
+    const noack_trigger_rule *rule = exact->rule;
     int64_t square = code->n * code->stride, n = exact->n, curve = TERMS * code->stride;
     int64_t blocks = blocks_of(rule, code);
     free_scratch scratch = {begin, code};
@@ -263,8 +262,8 @@ noack_exact *noack_exact_new(const noack_exact_settings *settings, const char **
     exact->settings = *settings;
     exact->code = code_for(settings);
     exact->fates = copy_of(settings->fates, settings->fate_count, sizeof *exact->fates);
-    double *begin = zeros_in_lines(
-        scratch_length(&settings->rule, exact->code), sizeof *begin, &exact->scratch);
+    double *begin =
+        zeros_in_lines(scratch_length(settings->rule, exact->code), sizeof *begin, &exact->scratch);
     if (exact->fates == NULL || begin == NULL) {
         noack_exact_free(exact);
         return NULL;
@@ -314,7 +313,7 @@ void noack_exact_runs(
             state[2 * code->stride + i] = exact->known_start ? 0.0 : 0.0 - state[i];
         }
         run.event = !exact->known_start;
-        run.auxiliary = memory->dynamic ? exact->rule.initial : 0.0;
+        run.auxiliary = memory->dynamic ? exact->rule->initial : 0.0;
         code->follow(memory, &run);
     }
 }

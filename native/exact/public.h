@@ -55,7 +55,7 @@ typedef struct {
     double *H, *K;           /* (n, n) of both models between updates; (m, n) the gain */
     /* symmetric weights of the cost, (n, n) and (m, m); NULL: the identity */
     double *Q, *R;
-    noack_trigger_rule rule;
+    const noack_trigger_rule *rule; /* must live longer */
     noack_link *link;        /* with one flow; NULL: fates */
     int64_t first_delivered; /* of a link */
     int64_t fate_count;

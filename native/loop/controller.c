@@ -6,6 +6,8 @@
    given. If the newest update is too old, it sends the safe input, or its last input again. The
    model's time advances with ticks and updates and never runs backward: an update older
    than the last tick is propagated to the time of that tick, a newer one advances the model. */
+#include <stdlib.h>
+
 #include "loop.h"
 
 int64_t noack_controller_handle(
@@ -45,7 +47,7 @@ int64_t noack_controller_handle(
 /* u = K(x - x_r) + u_r at t_ns, or the answer of the user's law. */
 static void apply_law(noack_controller *controller, int64_t t_ns, const double *x, double *u) {
     int64_t n = controller->machine.n, m = controller->machine.m;
-    const noack_reference *reference = &controller->model.reference;
+    const noack_reference *reference = controller->model.reference;
     double *difference = controller->scratch + n, *u_r = controller->scratch + 3 * n + m;
     if (controller->is_user) {
         copy(m, controller->u, u);
@@ -126,3 +128,42 @@ int64_t noack_controller_tick(noack_controller *controller, int64_t now_ns, noac
         append(output, n, controller->x_c);
     return NOACK_DONE;
 }
+
+/* How it is made. ------------------------------------------------------------------------------ */
+
+/* Check the numbers of a new controller, and complete them. */
+static const char *check(noack_controller *controller) {
+    noack_machine *machine = &controller->machine;
+    const char *wrong = begin_machine(machine, NOACK_UPDATE);
+    if (wrong != NULL)
+        return wrong;
+    int64_t n = machine->n, m = machine->m;
+    if (machine->period.ns < 1)
+        return "a controller has no period";
+    if (!is_between(1, controller->predictions, NOACK_MAX_ENTRIES)
+        || controller->predictions * m + (controller->carries_model ? n : 0) > NOACK_MAX_ENTRIES)
+        return "an actuation has more than 64 entries";
+    if (!is_model(&controller->model, n, n + m))
+        return "a controller has no model of its size";
+    if (controller->timeout_ns < 1)
+        return "a controller has a timeout below 1 ns";
+    machine->received.entries = n;
+    controller->model_ns = controller->update_ns = controller->asked_ns = 0;
+    controller->newest = NOACK_NO_SEQUENCE;
+    return NULL;
+}
+
+noack_controller *noack_controller_new(const noack_controller *settings, const char **wrong) {
+    noack_controller controller = *settings;
+    if ((*wrong = check(&controller)) != NULL)
+        return NULL;
+    int64_t n = controller.machine.n, m = controller.machine.m;
+    owned_array arrays[] = {
+        {&controller.K, m * n, STATE}, {&controller.safe_input, m, STATE},
+        {&controller.x_c, n, STATE},   {&controller.x, n, STATE},
+        {&controller.u, m, STATE},     {&controller.scratch, 3 * n + 2 * m, STATE},
+    };
+    return with_arrays(&controller, sizeof controller, arrays, 6, NULL, wrong);
+}
+
+void noack_controller_free(noack_controller *controller) { free(controller); }

@@ -50,6 +50,26 @@ static inline void append(noack_output *output, int64_t count, const double *val
     output->message.entries += count;
 }
 
+/* Times and numbers of which a few sums, with the time of a message, fit into an int64_t. */
+#define MOST_NS (INT64_C(1) << 60)
+#define MOST_NUMBER (INT64_MAX / 2)
+
+/* Limits of lengths, within which their products fit, too. */
+enum { MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16, MOST_PARTS = 100000 };
+
+/* Whether a period has at least some whole nanoseconds; its multiples do not overflow. */
+static inline int is_period(const noack_period *period, int64_t least_ns) {
+    return is_between(least_ns, period->ns, MOST_NS) && is_between(1, period->parts, MOST_PARTS)
+           && is_between(0, period->part, period->parts - 1)
+           && (period->part == 0 || period->parts <= period->ns);
+}
+
+/* process.c: begin a new machine, which receives this flow; return NULL, or what is wrong. */
+const char *begin_machine(noack_machine *machine, int64_t flow);
+
+/* model.c: whether a model has n states, and a reference of at least this width. */
+int is_model(const noack_model *model, int64_t n, int64_t width);
+
 /* Let Python do what a step needs; return whether it did. */
 static inline int ask(const noack_machine *machine, int64_t question) {
     return machine->ask(machine->loop, question) == 0;
@@ -118,7 +138,6 @@ void noack_disturb(noack_plant *plant, int64_t step);
 
 /* observer.c: advance x-hat to a measurement [y; u of the plant's steps since the last one]. */
 void noack_observe(
-    noack_observer *observer, const noack_message *message, int64_t n, int64_t m,
-    const noack_period *plant_period);
+    noack_observer *observer, const noack_message *message, const noack_period *plant_period);
 
 #endif

@@ -3,9 +3,30 @@
    The reference x_r is the same in sensor and controller, so both models stay equal. Where it
    jumps, x does not. The same dt always gives the same matrix e^(H dt), whether it was kept or not.
  */
+#include <stdlib.h>
+
 #include "loop.h"
 
-enum { WAYS = 4 }; /* places at which a matrix can be */
+enum {
+    WAYS = 4, /* places at which a matrix can be */
+    MOST_PLACES = 1024,
+    MOST_KEPT = 1 << 20, /* entries of matrices */
+};
+
+struct noack_transitions {
+    int64_t n;
+    int64_t is_static; /* 1: H = 0 */
+    const double *H;   /* (n, n) */
+    int64_t places;    /* a power of 2 */
+    int64_t *steps_ns; /* (places,) dt of each place; 0: free */
+    double *matrices;  /* (places, n, n) */
+    double *scratch;   /* (10 n n + 3n,) */
+};
+
+int is_model(const noack_model *model, int64_t n, int64_t width) {
+    return model->transitions != NULL && model->transitions->n == n
+           && (model->reference == NULL || model->reference->width >= width);
+}
 
 const double *noack_transition(noack_transitions *transitions, int64_t dt_ns) {
     int64_t size = transitions->n * transitions->n, last = transitions->places - 1;
@@ -41,9 +62,9 @@ static void advance_about(
     const noack_model *model, int64_t segment, const double *x, int64_t from_ns, int64_t to_ns,
     double *result) {
     int64_t n = model->transitions->n;
-    const noack_reference *reference = &model->reference;
+    const noack_reference *reference = model->reference;
     double *point = model->transitions->scratch + 10 * n * n, *advanced = point + n;
-    if (reference->is_zero[segment] || to_ns == from_ns) {
+    if (reference == NULL || reference->is_zero[segment] || to_ns == from_ns) {
         propagate(model->transitions, x, to_ns - from_ns, advanced);
         copy(n, advanced, result);
         return;
@@ -59,12 +80,36 @@ static void advance_about(
 
 void noack_model_advance(
     const noack_model *model, const double *x, int64_t from_ns, int64_t to_ns, double *result) {
-    const noack_reference *reference = &model->reference;
-    int64_t segment = first_above(reference->since_ns, 0, reference->changes, from_ns);
-    while (segment < reference->changes && reference->since_ns[segment] < to_ns) {
+    const noack_reference *reference = model->reference;
+    int64_t changes = reference == NULL ? 0 : reference->changes;
+    int64_t segment = changes == 0 ? 0 : first_above(reference->since_ns, 0, changes, from_ns);
+    while (segment < changes && reference->since_ns[segment] < to_ns) {
         advance_about(model, segment, x, from_ns, reference->since_ns[segment], result);
         x = result;
         from_ns = reference->since_ns[segment++];
     }
     advance_about(model, segment, x, from_ns, to_ns, result);
 }
+
+/* How it is made. ------------------------------------------------------------------------------ */
+
+noack_transitions *noack_transitions_new(int64_t n, const double *H, const char **wrong) {
+    *wrong = is_between(1, n, NOACK_MAX_ENTRIES) ? NULL : "a model needs 1 to 64 states";
+    if (*wrong != NULL)
+        return NULL;
+    int64_t size = n * n, places = MOST_PLACES;
+    while (places > WAYS && places * size > MOST_KEPT)
+        places /= 2;
+    noack_transitions transitions = {.n = n, .is_static = 1, .H = H, .places = places};
+    for (int64_t k = 0; H != NULL && k < size; k++)
+        transitions.is_static &= H[k] == 0.0;
+    owned_array arrays[] = {
+        {&transitions.H, size, NEEDED},
+        {&transitions.steps_ns, places, STATE},
+        {&transitions.matrices, places * size, STATE},
+        {&transitions.scratch, 10 * size + 3 * n, STATE},
+    };
+    return with_arrays(&transitions, sizeof transitions, arrays, 4, "a model has no matrix", wrong);
+}
+
+void noack_transitions_free(noack_transitions *transitions) { free(transitions); }

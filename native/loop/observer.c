@@ -5,6 +5,7 @@
    Bucy and Joseph, P <- (I - L C) P (I - L C)' + L R L'. Thus P stays symmetric and positive
    semidefinite for any rounding error of L. */
 #include <math.h>
+#include <stdlib.h>
 
 #include "loop.h"
 
@@ -43,7 +44,8 @@ static void solve(int64_t p, int64_t n, double *S, double *B) {
         }
 }
 
-void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, const double *u) {
+void noack_observer_predict(noack_observer *observer, const double *u) {
+    int64_t n = observer->n, m = observer->m;
     double *free_part = observer->scratch, *forced_part = free_part + n;
     noack_product(n, n, observer->Ad, observer->x, free_part);
     noack_product(n, m, observer->Bd, u, forced_part);
@@ -58,10 +60,10 @@ void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, cons
         observer->P[k] += observer->Q[k];
 }
 
-void noack_observer_gain(noack_observer *observer, int64_t n) {
+void noack_observer_gain(noack_observer *observer) {
     if (observer->kind != NOACK_KALMAN)
         return;
-    int64_t p = observer->p;
+    int64_t n = observer->n, p = observer->p;
     double *CP = observer->scratch, *S = CP + n * p;
     noack_multiply(p, n, n, observer->C, observer->P, 0, CP);
     noack_multiply(p, n, p, CP, observer->C, 1, S);
@@ -74,8 +76,8 @@ void noack_observer_gain(noack_observer *observer, int64_t n) {
 }
 
 /* P <- (I - L C) P (I - L C)' + L R L', made symmetric. */
-static void correct_covariance(noack_observer *observer, int64_t n) {
-    int64_t p = observer->p, size = n * n;
+static void correct_covariance(noack_observer *observer) {
+    int64_t n = observer->n, p = observer->p, size = n * n;
     double *I_minus_LC = observer->scratch, *half = I_minus_LC + size, *next = half + size,
            *LR = next + size;
     noack_multiply(n, p, n, observer->gain, observer->C, 0, I_minus_LC);
@@ -94,9 +96,8 @@ static void correct_covariance(noack_observer *observer, int64_t n) {
 }
 
 /* x <- x + gain (y - C x). */
-static void correct_estimate(
-    noack_observer *observer, int64_t n, const double *gain, const double *y) {
-    int64_t p = observer->p;
+static void correct_estimate(noack_observer *observer, const double *gain, const double *y) {
+    int64_t n = observer->n, p = observer->p;
     double *innovation = observer->scratch, *change = innovation + p;
     noack_product(p, n, observer->C, observer->x, innovation);
     for (int64_t k = 0; k < p; k++)
@@ -106,28 +107,64 @@ static void correct_estimate(
         observer->x[k] += change[k];
 }
 
-void noack_observer_correct(noack_observer *observer, int64_t n, const double *y) {
-    noack_observer_gain(observer, n);
-    correct_estimate(observer, n, observer->gain, y);
+void noack_observer_correct(noack_observer *observer, const double *y) {
+    noack_observer_gain(observer);
+    correct_estimate(observer, observer->gain, y);
     if (observer->kind == NOACK_KALMAN)
-        correct_covariance(observer, n);
+        correct_covariance(observer);
 }
 
 /* The inputs of steps that a missing measurement would have reported are unknown: the first known
    input is used. */
 void noack_observe(
-    noack_observer *observer, const noack_message *message, int64_t n, int64_t m,
-    const noack_period *plant_period) {
-    int64_t t_ns = message->t_ns, known = (message->entries - observer->p) / m;
+    noack_observer *observer, const noack_message *message, const noack_period *plant_period) {
+    int64_t t_ns = message->t_ns, m = observer->m, known = (message->entries - observer->p) / m;
     /* Times are rounded to whole nanoseconds, so the difference may be 1 ns too short. */
     int64_t age_ns = t_ns - observer->t_ns + (plant_period->part > 0);
     int64_t steps = observer->t_ns < 0 || age_ns < 0 ? 0 : periods_within(plant_period, age_ns);
     const double *inputs = message->vector + observer->p;
     for (int64_t before = steps; before > 0; before--)
-        noack_observer_predict(observer, n, m, inputs + m * max_of(known - before, 0));
+        noack_observer_predict(observer, inputs + m * max_of(known - before, 0));
     if (observer->t_ns < 0 && observer->first_gain != NULL)
-        correct_estimate(observer, n, observer->first_gain, message->vector);
+        correct_estimate(observer, observer->first_gain, message->vector);
     else
-        noack_observer_correct(observer, n, message->vector);
+        noack_observer_correct(observer, message->vector);
     observer->t_ns = t_ns;
 }
+
+/* How it is made. ------------------------------------------------------------------------------ */
+
+static const char *check(const noack_observer *observer) {
+    if (!is_between(1, observer->n, NOACK_MAX_ENTRIES)
+        || !is_between(1, observer->m, NOACK_MAX_ENTRIES)
+        || !is_between(1, observer->p, NOACK_MAX_ENTRIES))
+        return "an observer needs 1 to 64 states, inputs and outputs";
+    if (!is_between(NOACK_LUENBERGER, observer->kind, NOACK_KALMAN)
+        || !is_between(-1, observer->t_ns, MESSAGE_TIMES_NS))
+        return "an observer is of an unknown kind, or has a time out of range";
+    return NULL;
+}
+
+noack_observer *noack_observer_new(const noack_observer *settings, const char **wrong) {
+    noack_observer observer = *settings;
+    if ((*wrong = check(&observer)) != NULL)
+        return NULL;
+    int64_t n = observer.n, m = observer.m, p = observer.p;
+    int is_kalman = observer.kind == NOACK_KALMAN, of_kalman = is_kalman ? NEEDED : OPTIONAL;
+    observer.scratch = NULL;
+    owned_array arrays[] = {
+        {&observer.Ad, n * n, NEEDED},
+        {&observer.Bd, n * m, NEEDED},
+        {&observer.C, p * n, NEEDED},
+        {&observer.gain, n * p, is_kalman ? STATE : NEEDED},
+        {&observer.first_gain, n * p, OPTIONAL},
+        {&observer.Q, n * n, of_kalman},
+        {&observer.R, p * p, of_kalman},
+        {&observer.P, n * n, of_kalman},
+        {&observer.x, n, STATE},
+        {&observer.scratch, 3 * n * n + n * p + p * p + 2 * n + p, STATE},
+    };
+    return with_arrays(&observer, sizeof observer, arrays, 10, "an observer lacks a matrix", wrong);
+}
+
+void noack_observer_free(noack_observer *observer) { free(observer); }

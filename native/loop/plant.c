@@ -9,6 +9,8 @@
    h_c is the period of the controller. Input j is applied from t + j h_c on, the last one until a
    newer actuation arrives, or until the watchdog chooses the input: the newest actuation is too old
    if t_k - t > timeout. Before the first actuation its time is 0. */
+#include <stdlib.h>
+
 #include "loop.h"
 
 static int has(const noack_signal *signal, int64_t step) {
@@ -183,3 +185,87 @@ int64_t noack_plant_tick(
         measure(plant, t_ns, output);
     return NOACK_DONE;
 }
+
+/* How it is made. ------------------------------------------------------------------------------ */
+
+static const char *check_signal(const noack_signal *signal, int64_t width) {
+    if (signal->width != 0
+        && (signal->width != width || !is_between(1, signal->rows, MOST_ROWS)
+            || !is_between(-MOST_NUMBER, signal->first, MOST_NUMBER)))
+        return "a disturbance or noise does not have the width of the vector that it is added to";
+    return NULL;
+}
+
+/* Check the numbers of a new plant, and complete them. */
+static const char *check(noack_plant *plant) {
+    noack_machine *machine = &plant->machine;
+    const char *wrong = begin_machine(machine, NOACK_ACTUATION);
+    if (wrong != NULL)
+        return wrong;
+    int64_t n = machine->n, m = machine->m;
+    if (machine->period.ns < 1 || !is_period(&plant->input_period, 1))
+        return "a plant has no period";
+    if (plant->C == NULL)
+        plant->p = n;
+    if (!is_between(1, plant->measure_every, MOST_EVERY)
+        || !is_between(1, plant->p, NOACK_MAX_ENTRIES))
+        return "a plant has no measurement";
+    if (!is_between(NOACK_LINEAR, plant->system, NOACK_FAILED)
+        || !is_between(NOACK_HOLD, plant->watchdog, NOACK_PREDICT))
+        return "a plant has an unknown system or watchdog";
+    if (!is_between(0, plant->internal, NOACK_MAX_ROW_WORDS - 6 - 4 * NOACK_MAX_ENTRIES))
+        return "a plant's system has too many states of its own";
+    if ((wrong = check_signal(&plant->at_input, m)) != NULL
+        || (wrong = check_signal(&plant->at_state, n)) != NULL
+        || (wrong = check_signal(&plant->noise, plant->p)) != NULL)
+        return wrong;
+    if (!is_between(1, plant->predictions, NOACK_MAX_ENTRIES)
+        || plant->predictions * m + (plant->carries_model ? n : 0) > NOACK_MAX_ENTRIES)
+        return "an actuation has more than 64 entries";
+    if (plant->p + (plant->reports_inputs ? plant->measure_every * m : 0) > NOACK_MAX_ENTRIES)
+        return "a measurement has more than 64 entries";
+    if (plant->timeout_ns < 0 || plant->notice_ns < 0)
+        return "a plant has a timeout below 0";
+    if (plant->watchdog == NOACK_PREDICT
+        && (!plant->carries_model || !is_model(&plant->fallback, n, n)))
+        return "a watchdog that predicts has no model";
+    machine->received.entries = plant->predictions * m + (plant->carries_model ? n : 0);
+    plant->sources = m + plant->at_state.width;
+    plant->measurements = plant->newest_ns = plant->fallback_ns = 0;
+    plant->newest_sequence = plant->fallback_sequence = NOACK_NO_SEQUENCE;
+    plant->missing_ns = -1;
+    return NULL;
+}
+
+noack_plant *noack_plant_new(const noack_plant *settings, const char **wrong) {
+    noack_plant plant = *settings;
+    if ((*wrong = check(&plant)) != NULL)
+        return NULL;
+    int64_t n = plant.machine.n, m = plant.machine.m, sources = plant.sources;
+    int64_t lengths = plant.machine.period.part > 0 ? 2 : 1;
+    int64_t reported = plant.reports_inputs ? plant.measure_every * m : 0;
+    int of_linear = plant.system == NOACK_LINEAR ? NEEDED : OPTIONAL;
+    owned_array arrays[] = {
+        {&plant.Ad, lengths * n * n, of_linear},
+        {&plant.Bd, lengths * n * sources, of_linear},
+        {&plant.C, plant.p * n, OPTIONAL},
+        {&plant.K, m * n, plant.watchdog == NOACK_PREDICT ? NEEDED : OPTIONAL},
+        {&plant.at_input.values, plant.at_input.rows * plant.at_input.width, STATE},
+        {&plant.at_state.values, plant.at_state.rows * plant.at_state.width, STATE},
+        {&plant.noise.values, plant.noise.rows * plant.noise.width, STATE},
+        {&plant.x, n, STATE},
+        {&plant.z, plant.internal, STATE},
+        {&plant.u, m, STATE},
+        {&plant.applied, sources, STATE},
+        {&plant.recent_inputs, reported, STATE},
+        {&plant.inputs, plant.predictions * m, STATE},
+        {&plant.x_c, n, STATE},
+        {&plant.x_fallback, n, STATE},
+        {&plant.scratch, 2 * n + 2 * m, STATE},
+    };
+    return with_arrays(
+        &plant, sizeof plant, arrays, sizeof arrays / sizeof *arrays,
+        "a plant lacks the matrices of its system or its watchdog", wrong);
+}
+
+void noack_plant_free(noack_plant *plant) { free(plant); }

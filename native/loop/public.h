@@ -1,10 +1,16 @@
-/* The machines of a loop, and the wire format of their messages. */
+/* The machines of a loop, and the wire format of their messages.
+
+   Each ..._new takes a structure with settings, and returns one with arrays and a state of its own,
+   which Python reads and writes when a step asks. A state that is not given (NULL) is 0. What a
+   handle points to must live longer: transitions, reference, rule and observer than a machine, the
+   machines than their process. */
 
 /* ---- A trigger rule, and its condition since the last event ---------------------------------- */
 
 /* A trigger rule, as noack.trigger_policies.trigger_rule has it. With z = (x, e_s), the sensor transmits as
    soon as |P z|^2 > max(c e^(-rho (t - t_0)), f)^2 + |N z|^2 + eta. */
 typedef struct {
+    int64_t n;
     double level, rate_per_s, floor; /* c, rho, f */
     int64_t since_ns;                /* t_0: 0, or the last change of a rate */
     int64_t from_event;              /* 1: t_0 is instead the last event, and c is |P z| just after it */
@@ -20,13 +26,18 @@ typedef struct {
     double beta, alpha_per_s, forecast_floor;
     double growth_per_s, mismatch_per_s, disturbance_per_s;
     int64_t positive_rows, negative_rows, positive_gain_rows, negative_gain_rows;
-    double *positive, *negative;               /* P and N, (rows, 2n) */
+    double *positive, *negative;               /* P and N, (rows, 2n); NULL: no rows */
     double *positive_gain, *negative_gain;     /* of the rate of eta: |P_eta z|^2 - |N_eta z|^2 */
     /* W of the norm that is recorded, (n, n); NULL: the identity */
     double *weight;
     /* of the norm of x that a forecast begins with; NULL: likewise */
     double *forecast_weight;
+    double *scratch;                           /* (3n + rows of the longest matrix,) */
 } noack_trigger_rule;
+
+noack_trigger_rule *noack_trigger_rule_new(
+    const noack_trigger_rule *settings, const char **wrong);
+void noack_trigger_rule_free(noack_trigger_rule *rule);
 
 /* The condition of a trigger rule since the last event. */
 typedef struct {
@@ -65,7 +76,6 @@ enum noack_question {
     NOACK_ASK_RESTART,  /* the user's trigger begins again with an acknowledged event */
     NOACK_ASK_UPDATE,   /* the user's control law receives the state of an update */
     NOACK_ASK_INPUT,    /* the user's control law: set u */
-    NOACK_ASK_ROOM,     /* there is no room for another update that waits for its acknowledgement */
     NOACK_ROWS_FULL,    /* a table of rows or notes must be emptied; the step is then repeated */
     NOACK_NOT_ANSWERED, /* Python could not answer: the step was not done */
     NOACK_NO_MEMORY     /* the step cannot be done */
@@ -96,16 +106,14 @@ typedef struct {
     double *values; /* (rows, width) of the steps from first on */
 } noack_signal;
 
-/* The matrices e^(H dt) for the dt that occurred lately; loops with the same H may share them. */
-typedef struct {
-    int64_t n;
-    int64_t is_static; /* 1: H = 0 */
-    double *H;         /* (n, n) */
-    int64_t places;    /* a power of 2 */
-    int64_t *steps_ns; /* (places,) dt of each place; 0: free */
-    double *matrices;  /* (places, n, n) */
-    double *scratch;   /* (10 n n + 3n,) */
-} noack_transitions;
+/* The matrices e^(H dt) for the dt that occurred lately; loops with the same H, (n, n), may share
+   them. */
+typedef struct noack_transitions noack_transitions;
+noack_transitions *noack_transitions_new(int64_t n, const double *H, const char **wrong);
+void noack_transitions_free(noack_transitions *transitions);
+
+/* The matrix e^(H dt), which the next call may replace. */
+const double *noack_transition(noack_transitions *transitions, int64_t dt_ns);
 
 /* The reference x_r(t), u_r(t): segments, each a polynomial of the seconds since its begin, plus
    sine waves. The first begins at 0, and holds before that, too. */
@@ -113,16 +121,19 @@ typedef struct {
     int64_t width;         /* numbers of a row: n, or n + m with those of u_r */
     int64_t changes;       /* from one segment to the next */
     int64_t *since_ns;     /* (changes,) ascending */
-    int64_t *is_zero;      /* (changes + 1,) 1: x_r and u_r are 0 */
+    int64_t *is_zero;      /* (changes + 1,) 1: x_r and u_r are 0; not to be given */
     int64_t powers, waves; /* of each segment; at least 1, at least 0 */
     double *hz;            /* (changes + 1, waves) */
     double *rows;          /* (changes + 1, powers + 2 waves, width): of 1, t, ...; sine, cosine ... */
 } noack_reference;
 
+noack_reference *noack_reference_new(const noack_reference *settings, const char **wrong);
+void noack_reference_free(noack_reference *reference);
+
 /* The model between updates: d(x - x_r)/dt = H(x - x_r). */
 typedef struct {
     noack_transitions *transitions;
-    noack_reference reference;
+    const noack_reference *reference; /* NULL: 0 */
 } noack_model;
 
 /* A period of ns + part / parts nanoseconds. */
@@ -135,10 +146,12 @@ typedef struct {
     int64_t n, m;
     /* time of the run at which the loop begins; other times are the loop's own */
     int64_t phase_ns;
-    int64_t step;                /* number of the next tick */
     int64_t first_ns;            /* tick k is due at first_ns + the nearest whole ns to k T */
-    noack_period period;         /* T; 0: no ticks */
-    int64_t horizon_ns;          /* no tick is later */
+    noack_period period;         /* T; a sensor has no ticks */
+    int64_t horizon_ns;          /* no tick is later, and no message's time */
+
+    /* State */
+    int64_t step;                /* number of the next tick */
     int64_t inputs;              /* number of the next input */
     /* time up to which the present settings have been used; -1: none */
     int64_t reached_ns;
@@ -161,20 +174,20 @@ enum noack_system {
     NOACK_FAILED /* nothing: the state stays as it is */
 };
 
-enum noack_observer_kind { NOACK_NO_OBSERVER, NOACK_LUENBERGER, NOACK_KALMAN };
+enum noack_observer_kind { NOACK_LUENBERGER, NOACK_KALMAN };
 
-/* The machine of a plant; plant_server/plant.py makes it. */
+/* The machine of a plant; plant_server/plant.py describes it. */
 typedef struct {
     noack_machine machine;
 
     /* Settings */
     int64_t internal;                       /* entries of z, the user's system's own state */
     int64_t system;                         /* enum noack_system */
-    int64_t sources;                        /* columns of Bd: m, or m + n if x is disturbed */
+    int64_t sources;                        /* columns of Bd: m + at_state.width */
     /* over a step of period.ns, (n, n) and (n, sources); behind each, if a part remains, those of
        a step that is 1 ns longer */
     double *Ad, *Bd;
-    double *C;                              /* (p, n); NULL: the identity */
+    double *C;                              /* (p, n); NULL: the identity, p is n */
     int64_t p;
     noack_signal at_input, at_state, noise; /* d of each step, w of each step, v by measurement */
     int64_t measure_every;
@@ -205,39 +218,46 @@ typedef struct {
     double *scratch;                        /* (2n + 2m,) */
 } noack_plant;
 
+noack_plant *noack_plant_new(const noack_plant *settings, const char **wrong);
+void noack_plant_free(noack_plant *plant);
+
 /* The observer of a sensor. Luenberger: the gain is given. Kalman: it follows from P. */
 typedef struct {
-    int64_t kind;    /* enum noack_observer_kind */
-    int64_t p;
+    int64_t kind;     /* enum noack_observer_kind */
+    int64_t n, m, p;
+    int64_t reported; /* entries of a measurement that are inputs applied, behind y */
     double *Ad, *Bd, *C;
     double *Q, *R;   /* (n, n), (p, p) */
-    double *gain;    /* (n, p) */
+    double *gain;    /* (n, p); of a Kalman filter not to be given */
     double *first_gain; /* (n, p) at the first measurement, of an estimate without a time; NULL: gain */
     double *x, *P;   /* the state: (n,), (n, n) */
     int64_t t_ns;    /* time of the estimate; -1: that of the first measurement */
     double *scratch; /* (3 n n + n p + p p + 2n + p,) */
 } noack_observer;
 
-/* The machine of a sensor; sensor_node/sensor.py makes it. */
+noack_observer *noack_observer_new(const noack_observer *settings, const char **wrong);
+void noack_observer_free(noack_observer *observer);
+
+/* The machine of a sensor; sensor_node/sensor.py describes it. */
 typedef struct {
     noack_machine machine;
 
     /* Settings */
     noack_model model;
-    noack_trigger_rule rule;
+    const noack_trigger_rule *rule; /* of a user's trigger only its weight counts */
     int64_t is_user;       /* 1: the user's trigger decides */
     int64_t acknowledged;  /* 1: only an acknowledged update resets x_s */
     int64_t timeout_ns;    /* of an acknowledgement */
     int64_t reports_error; /* 1: updates have an error level, by which the network chooses */
     noack_period plant_period;
-    noack_observer observer;
+    noack_observer *observer; /* NULL: none */
 
     /* State */
     noack_trigger_state trigger;
-    double *x_s;           /* (n,) */
+    double *x_s;           /* (n,) at the start that of the settings */
     double *event_x;       /* (n,) x - x_r at the last event */
     int64_t model_ns;
-    int64_t has_state;     /* 0: the first measurement is an event */
+    int64_t has_state;     /* of the settings: 0: the first measurement is an event */
     int64_t events;        /* number of the next one */
     int64_t wait_ns;       /* time until which it waits for an acknowledgement; -1: it does not */
     int64_t sent_count, sent_places;
@@ -252,16 +272,19 @@ typedef struct {
     int64_t event;
     double left, right;
 
-    double *scratch;       /* (5n + rows of the rule's longest matrix,) */
+    double *scratch;       /* (2n,) */
 } noack_sensor;
 
-/* The machine of a controller; controller_node/controller.py makes it. */
+noack_sensor *noack_sensor_new(const noack_sensor *settings, const char **wrong);
+void noack_sensor_free(noack_sensor *sensor);
+
+/* The machine of a controller; controller_node/controller.py describes it. */
 typedef struct {
     noack_machine machine;
 
     /* Settings */
     noack_model model;
-    double *K;                          /* (m, n): u = K(x_c - x_r) + u_r */
+    double *K;                          /* (m, n): u = K(x_c - x_r) + u_r; of a user's law 0 */
     double *safe_input;                 /* (m,) */
     int64_t is_user;                    /* 1: the user's control law gives u */
     int64_t acknowledges;
@@ -270,9 +293,9 @@ typedef struct {
     int64_t holds_input;                /* 1: it then holds its last input, else the safe input */
 
     /* State */
-    double *x_c;                        /* (n,) */
+    double *x_c;                        /* (n,) at the start that of the settings */
     int64_t model_ns;
-    int64_t has_state;
+    int64_t has_state;                  /* of the settings: 0: there is no x_c before an update */
     int64_t newest;                     /* number of the last update; -1: none */
     int64_t update_ns;                  /* time of its event; 0: that of x(0) */
     /* (n,), (m,) the question to the user's law, and its answer; else the last input */
@@ -281,6 +304,9 @@ typedef struct {
 
     double *scratch;                    /* (3n + 2m,) */
 } noack_controller;
+
+noack_controller *noack_controller_new(const noack_controller *settings, const char **wrong);
+void noack_controller_free(noack_controller *controller);
 
 /* What a machine does at an input: it writes a row, and may send a message. */
 typedef struct {
@@ -300,6 +326,8 @@ typedef struct {
 } noack_note;
 
 enum noack_role { NOACK_PLANT, NOACK_SENSOR, NOACK_CONTROLLER };
+
+enum { NOACK_NOTES = 256 }; /* for which there is room until they are taken */
 
 /* The tables of rows of a machine; a sensor has no ticks. */
 enum noack_table_number {
@@ -321,33 +349,35 @@ enum noack_missing_word {
 /* Rows of a table of the record, packed as numpy has them. */
 typedef struct {
     int64_t row_bytes, places, count;
-    uint8_t *rows; /* (places, row_bytes) */
-    /* (loops,) for each word of a row: which word of the loop's own row it is, or a
-       noack_missing_word; NULL: the rows of this loop, or of all loops, are those of the table */
-    int64_t **layouts;
+    uint8_t *rows; /* (places, row_bytes), of the caller, who may give other rows between steps */
+    /* (kinds, words) for each word of a row: which word of a loop's own row it is, or a
+       noack_missing_word; NULL: the rows of all loops are those of the table */
+    int64_t kinds;
+    int64_t *layouts;
+    int64_t *kind_of; /* (loops,) which layout each loop has */
 } noack_table;
 
 /* The machines of one role, of all loops. */
 typedef struct {
     int64_t role, loops;
-    noack_plant *plants; /* (loops,) of this role; the others are NULL */
-    noack_sensor *sensors;
-    noack_controller *controllers;
+    noack_machine **machines; /* (loops,) */
     /* (loops,) the next tick of each machine that has one, in the run's time */
     noack_heap_entry *heap;
     int64_t heap_count;
     noack_table tables[NOACK_TABLES];
-    noack_note *notes;
-    int64_t note_places, note_count;
+    noack_note *notes;        /* (NOACK_NOTES,) */
+    int64_t note_count;
     noack_output output;
-    int64_t has_asked;   /* 1: since the driver set it to 0, a machine has asked */
+    int64_t has_asked;        /* 1: since the driver set it to 0, a machine has asked */
 } noack_process;
 
-/* Return NULL, or what is wrong with the numbers of a process: all that the steps assume. */
-const char *noack_process_check(const noack_process *process);
-
-/* Find the first tick of each machine. */
-void noack_process_begin(noack_process *process);
+/* Return a process of new machines, which ask by a function of Python, and of the tables that these
+   machines write: row_bytes, places, rows, and kinds with their layouts. */
+noack_process *noack_process_new(
+    int64_t role, int64_t loops, noack_machine *const *machines,
+    int64_t (*ask)(int64_t loop, int64_t question), const noack_table *tables,
+    const char **wrong);
+void noack_process_free(noack_process *process);
 
 /* The next tick of all machines in the run's time; INT64_MAX: none. */
 int64_t noack_process_due_ns(const noack_process *process);
@@ -380,21 +410,18 @@ int64_t noack_controller_tick(
 
 /* Begin a trigger's state at x; or begin again at an event. */
 void noack_trigger_start(
-    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
-    const double *x, double *scratch);
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t t_ns, const double *x);
 void noack_trigger_restart(
-    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
-    const double *x, double *scratch);
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t t_ns, const double *x);
 
 /* Set the threshold and the idle time as after an event at x. */
 void noack_trigger_condition(
-    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
-    const double *x, double *scratch);
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t t_ns, const double *x);
 
 /* Test a measurement: return whether there is an event, and both sides of the comparison. */
 int64_t noack_trigger_test(
-    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
-    const double *x, const double *e_s, double sides[2], double *scratch);
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t t_ns, const double *x,
+    const double *e_s, double sides[2]);
 
 /* How long after an event at t_s, with |x| = norm, the next one is forecast. */
 double noack_forecast_ns(const noack_trigger_rule *rule, double norm, double t_s);
@@ -416,14 +443,11 @@ void noack_reference_rows(
 void noack_model_advance(
     const noack_model *model, const double *x, int64_t from_ns, int64_t to_ns, double *result);
 
-/* The matrix e^(H dt), which the next call may replace. */
-const double *noack_transition(noack_transitions *transitions, int64_t dt_ns);
-
 /* The steps of an observer: the prediction over a period, and the correction by a measurement, for
    which a Kalman filter computes its gain. */
-void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, const double *u);
-void noack_observer_gain(noack_observer *observer, int64_t n);
-void noack_observer_correct(noack_observer *observer, int64_t n, const double *y);
+void noack_observer_predict(noack_observer *observer, const double *u);
+void noack_observer_gain(noack_observer *observer);
+void noack_observer_correct(noack_observer *observer, const double *y);
 
 /* ---- The wire format (docs/wire.md) ---------------------------------------------------------- */
 

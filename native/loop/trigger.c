@@ -3,6 +3,7 @@
    Between two measurements the rate of Girard's dynamic variable is as it was at the first; the
    integral of |P z| is formed by the trapezoidal rule. */
 #include <math.h>
+#include <stdlib.h>
 
 #include "loop.h"
 
@@ -51,9 +52,9 @@ double noack_forecast_ns(const noack_trigger_rule *rule, double norm, double t_s
 }
 
 void noack_trigger_condition(
-    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
-    const double *x, double *scratch) {
-    double *z = scratch, *image = scratch + 2 * n;
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t t_ns, const double *x) {
+    int64_t n = rule->n;
+    double *z = rule->scratch, *image = z + 2 * n;
     state->level = rule->level;
     state->since_ns = rule->since_ns;
     if (rule->from_event) {
@@ -93,21 +94,20 @@ static double auxiliary_after(
 }
 
 void noack_trigger_restart(
-    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
-    const double *x, double *scratch) {
-    noack_trigger_condition(rule, state, n, t_ns, x, scratch);
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t t_ns, const double *x) {
+    noack_trigger_condition(rule, state, t_ns, x);
     state->event_ns = t_ns;
     if (rule->integrates)
         state->auxiliary = state->rate = 0.0;
 }
 
 void noack_trigger_start(
-    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
-    const double *x, double *scratch) {
-    noack_trigger_restart(rule, state, n, t_ns, x, scratch);
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t t_ns, const double *x) {
+    double *z = rule->scratch;
+    noack_trigger_restart(rule, state, t_ns, x);
     state->measured_ns = t_ns;
-    set_z(n, x, NULL, scratch);
-    state->rate = rate_at(rule, n, scratch, scratch + 2 * n);
+    set_z(rule->n, x, NULL, z);
+    state->rate = rate_at(rule, rule->n, z, z + 2 * rule->n);
 }
 
 /* Both sides of the comparison; without an integral, as square roots. */
@@ -133,9 +133,10 @@ static void compare(
 }
 
 int64_t noack_trigger_test(
-    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
-    const double *x, const double *e_s, double sides[2], double *scratch) {
-    double *z = scratch, *image = scratch + 2 * n;
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t t_ns, const double *x,
+    const double *e_s, double sides[2]) {
+    int64_t n = rule->n;
+    double *z = rule->scratch, *image = z + 2 * n;
     set_z(n, x, e_s, z);
     if (rule->integrates || rule->is_dynamic) {
         double rate = rate_at(rule, n, z, image);
@@ -150,3 +151,46 @@ int64_t noack_trigger_test(
     int counts = t_ns >= state->earliest_ns && (rule->grid_ns == 0 || t_ns % rule->grid_ns == 0);
     return counts && sides[0] > sides[1];
 }
+
+/* How it is made. ------------------------------------------------------------------------------ */
+
+static const char *check(const noack_trigger_rule *rule) {
+    const int64_t rows[] = {
+        rule->positive_rows, rule->negative_rows, rule->positive_gain_rows,
+        rule->negative_gain_rows};
+    double *const matrices[] = {
+        rule->positive, rule->negative, rule->positive_gain, rule->negative_gain};
+    if (!is_between(1, rule->n, NOACK_MAX_ENTRIES))
+        return "a trigger rule needs 1 to 64 states";
+    for (int k = 0; k < 4; k++)
+        if (!is_between(0, rows[k], 4 * NOACK_MAX_ENTRIES) || (rows[k] > 0 && matrices[k] == NULL))
+            return "a trigger rule has no matrix";
+    if (!is_between(0, rule->since_ns, MOST_NS) || !is_between(0, rule->grid_ns, MOST_NS)
+        || !is_between(-MOST_NS, rule->idle_ns, MOST_NS)
+        || !is_between(0, rule->shortest_ns, MOST_NS) || !is_between(0, rule->longest_ns, MOST_NS))
+        return "a trigger rule has times out of range";
+    return NULL;
+}
+
+noack_trigger_rule *noack_trigger_rule_new(const noack_trigger_rule *settings, const char **wrong) {
+    noack_trigger_rule rule = *settings;
+    if ((*wrong = check(&rule)) != NULL)
+        return NULL;
+    int64_t n = rule.n;
+    int64_t longest = max_of(
+        max_of(rule.positive_rows, rule.negative_rows),
+        max_of(rule.positive_gain_rows, rule.negative_gain_rows));
+    rule.scratch = NULL;
+    owned_array arrays[] = {
+        {&rule.positive, rule.positive_rows * 2 * n, OPTIONAL},
+        {&rule.negative, rule.negative_rows * 2 * n, OPTIONAL},
+        {&rule.positive_gain, rule.positive_gain_rows * 2 * n, OPTIONAL},
+        {&rule.negative_gain, rule.negative_gain_rows * 2 * n, OPTIONAL},
+        {&rule.weight, n * n, OPTIONAL},
+        {&rule.forecast_weight, n * n, OPTIONAL},
+        {&rule.scratch, 3 * n + longest, STATE},
+    };
+    return with_arrays(&rule, sizeof rule, arrays, 7, NULL, wrong);
+}
+
+void noack_trigger_rule_free(noack_trigger_rule *rule) { free(rule); }

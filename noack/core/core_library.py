@@ -1,22 +1,22 @@
-"""The core in C (native/): its functions, numpy's row types of its structures, and their memory.
+"""The core in C (native/): its functions, its handles, and numpy's row types of its structures.
 
 The library is built ahead of time, by ``make setup`` or with the wheel. Nothing is compiled here.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
-from itertools import accumulate
 from pathlib import Path
-from typing import Any, TypeVar
+from types import MappingProxyType
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from noack.core.errors import CallerError
 
 LIBRARY = Path(__file__).with_name("libnoack.so")
-T = TypeVar("T")
 CData = Any
 """A structure or pointer of the core: mypy does not know its fields."""
 AnyArray = NDArray[np.generic]
@@ -26,8 +26,6 @@ StructRows = NDArray[np.void]
 Reals = NDArray[np.float64]
 SCRATCH_MATRICES = 10
 """Matrices of a matrix's size that the core needs for scratch, for its exponential."""
-_MOST_PLACES, _MOST_NUMBERS = 1024, 2**20
-"""Maximum number of matrices that transitions keep, and of their entries."""
 _REMEDY = "run `make setup` in the repository, or install noack again"
 
 try:
@@ -141,115 +139,42 @@ def address_of(pointer: CData) -> int:
     return int(ffi.cast("intptr_t", pointer))
 
 
-class CoreMemory:
-    """Arrays that structures of the core point to.
+def new_structure(kind: str, numbers: Mapping[str, object] = MappingProxyType({})) -> CData:
+    """Return a new structure of the core with these numbers, which functions of the core copy.
 
-    >>> memory = CoreMemory()
-    >>> x = memory.reals([1.0, 2.0])
-    >>> x[1]
-    2.0
+    >>> new_structure("noack_signal", {"width": 2, "values": np.ones((3, 2))}).values[5]
+    1.0
     """
-
-    def __init__(self) -> None:
-        self._owners: list[object] = []
-        self._transitions: dict[bytes, CData] = {}
-        self._shared: list[AnyArray] = []
-
-    def keep(self, owner: T) -> T:
-        """Keep an object alive as long as this memory; return it."""
-        self._owners.append(owner)
-        return owner
-
-    def reals(self, values: ArrayLike) -> CData:
-        """Return a pointer to a copy of numbers, ``double *``."""
-        return self._pointer(np.array(values, np.float64, order="C"), "double *")
-
-    def integers(self, values: ArrayLike) -> CData:
-        """Return a pointer to a copy of whole numbers, ``int64_t *``."""
-        return self._pointer(np.array(values, np.int64, order="C"), "int64_t *")
-
-    def zeros(self, count: int) -> CData:
-        """Return a pointer to zeros, ``double *``; memory is taken when it is first used."""
-        return self._pointer(np.zeros(max(count, 1)), "double *")
-
-    def transitions(self, H: Reals, steps_ns: Iterable[int] = ()) -> CData:
-        """Return the ``noack_transitions *`` of H, (n, n); loops with the same H share it.
-
-        The matrices of ``steps_ns`` are computed at once, so that first deadlines are not delayed.
-        """
-        H = np.array(H, np.float64, order="C")
-        shared = self._transitions.get(H.tobytes())
-        if shared is None:
-            shared = self._transitions[H.tobytes()] = self._new_transitions(H)
-        if not shared.is_static:
-            for step_ns in steps_ns:
-                if step_ns > 0:
-                    core.noack_transition(shared, step_ns)
-        return shared
-
-    def fill(self, structure: CData, numbers: Mapping[str, object]) -> None:
-        """Set fields of a structure; an array becomes a pointer to a copy of it."""
-        for name, number in numbers.items():
-            value = self.reals(number) if isinstance(number, np.ndarray) else number
-            setattr(structure, name, ffi.NULL if value is None else value)
-
-    @property
-    def mark(self) -> int:
-        """How much this memory keeps now; :meth:`copy` copies what was added since."""
-        return len(self._owners)
-
-    def copy(self, structures: CData, first: int, others: Sequence[int], mark: int) -> None:
-        """Make structures of an array copies of one of them, each with arrays of its own.
-
-        Args:
-            structures: the array of structures.
-            first: number of the one that has been filled, since ``mark``.
-            others: numbers of those that become like it; they share its transition matrices.
-            mark: that of this memory before it was filled.
-        """
-        arrays = [owner.reshape(-1) for owner in self._owners[mark:] if isinstance(owner, np.ndarray)]
-        ends = [*accumulate(map(len, arrays), initial=0)]
-        copied = np.empty((len(others), ends[-1] + 1), np.uint64)
-        copied[:, : ends[-1]] = np.concatenate([array.view(np.uint64) for array in arrays])
-        self._owners.append(copied)
-        words = np.frombuffer(ffi.buffer(structures), np.uint64).reshape(len(structures), -1)
-        copies = np.repeat(words[None, first], len(others), axis=0)
-        starts = {array.ctypes.data: end for array, end in zip(arrays, ends[:-1], strict=True)}
-        for word in _pointer_words(ffi.typeof(structures).item):
-            if (start := starts.get(int(words[first, word]))) is not None:
-                copies[:, word] = copied.ctypes.data + start * 8 + copied.strides[0] * np.arange(len(copied))
-        words[others] = copies
-
-    def _new_transitions(self, H: Reals) -> CData:
-        n = len(H)
-        most_places = max(_MOST_NUMBERS // (n * n), 4)
-        places = min(_MOST_PLACES, 1 << most_places.bit_length() - 1)
-        transitions = ffi.new("noack_transitions *", {"n": n, "is_static": not H.any(), "places": places})
-        steps_ns, matrices = np.zeros(places, np.int64), np.zeros(places * n * n)
-        scratch = np.zeros(SCRATCH_MATRICES * n * n + 3 * n)
-        transitions.H, transitions.steps_ns = pointer_to(H, "double *"), pointer_to(steps_ns, "int64_t *")
-        transitions.matrices, transitions.scratch = (
-            pointer_to(array, "double *") for array in (matrices, scratch)
-        )
-        self._shared += [H, steps_ns, matrices, scratch]
-        return transitions
-
-    def _pointer(self, array: AnyArray, kind: str) -> CData:
-        self._owners.append(array)
-        return pointer_to(array, kind)
+    structure = ffi.new(f"{kind} *")
+    set_fields(structure, numbers)
+    return structure
 
 
-@cache
-def _pointer_words(kind: CData) -> tuple[int, ...]:
-    """Return the places of the pointers in a structure of words of 64 bits, e.g. noack_plant."""
-    words: list[int] = []
-    for _, field in kind.fields:
-        word = field.offset // 8
-        if field.type.kind == "pointer":
-            words.append(word)
-        elif field.type.kind == "struct":
-            words += (word + inner for inner in _pointer_words(field.type))
-    return tuple(words)
+def set_fields(structure: CData, numbers: Mapping[str, object]) -> None:
+    """Set fields of a structure that :func:`new_structure` has made.
+
+    An array becomes a pointer to a copy of it, which lives as long as the structure; None becomes
+    NULL; the fields of a structure within it are a mapping.
+    """
+    arrays = _ARRAYS.setdefault(structure, [])
+    _set_fields(structure, numbers, arrays)
+
+
+def _set_fields(structure: CData, numbers: Mapping[str, object], arrays: list[AnyArray]) -> None:
+    for name, number in numbers.items():
+        if isinstance(number, Mapping):
+            _set_fields(getattr(structure, name), number, arrays)
+        elif isinstance(number, np.ndarray):
+            whole = number.dtype.kind in "bi"
+            array = np.array(number, np.int64 if whole else np.float64, order="C")
+            arrays.append(array)
+            setattr(structure, name, pointer_to(array, "int64_t *" if whole else "double *"))
+        else:
+            setattr(structure, name, ffi.NULL if number is None else number)
+
+
+_ARRAYS: "WeakKeyDictionary[CData, list[AnyArray]]" = WeakKeyDictionary()
+"""What structures point to."""
 
 
 def reals_at(pointer: CData, *shape: int) -> Reals:

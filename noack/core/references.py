@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import CData, CoreMemory, core, ffi, pointer_to
+from noack.core.core_library import CData, core, new_handle, new_structure, pointer_to
 from noack.core.linear_systems import Matrix, Propagator, Vector
 
 
@@ -73,9 +73,8 @@ class Reference:
         self.segments, self.n = tuple(segments), n
         self.since_ns = [segment.begin_ns for segment in segments[1:]]
         """Where one segment ends and the next begins."""
-        self._memory = CoreMemory()
-        self._core = ffi.new("noack_reference *")
-        self.fill(self._core, self._memory)
+        self.core: CData = new_handle("reference", new_structure("noack_reference", self._numbers()))
+        """The ``noack_reference``."""
 
     @classmethod
     def constant(cls, x_r: Vector, u_r: Vector) -> "Reference":
@@ -112,7 +111,7 @@ class Reference:
         times = np.ascontiguousarray(t_ns, np.int64)
         result = np.zeros((len(times), self.width))
         core.noack_reference_rows(
-            self._core, len(times), pointer_to(times, "int64_t *"), pointer_to(result, "double *")
+            self.core, len(times), pointer_to(times, "int64_t *"), pointer_to(result, "double *")
         )
         return result
 
@@ -127,15 +126,15 @@ class Reference:
     def in_segment(self, place: int, t_ns: int) -> Vector:
         """Return x_r of a segment at a time, (n,): at its end, the limit from the left."""
         result = np.zeros(self.n)
-        core.noack_reference_part(self._core, place, t_ns, 0, self.n, pointer_to(result, "double *"))
+        core.noack_reference_part(self.core, place, t_ns, 0, self.n, pointer_to(result, "double *"))
         return result
 
     def input(self, t_ns: int) -> Vector:
         """Return u_r at a time, (m,)."""
         return self.rows(np.array([t_ns]))[0, self.n :]
 
-    def fill(self, reference: CData, memory: CoreMemory) -> None:
-        """Fill a ``noack_reference``."""
+    def _numbers(self) -> dict[str, object]:
+        """Return the fields of a ``noack_reference``."""
         powers = max(len(segment.polynomial) for segment in self.segments)
         waves = max(len(segment.hz) for segment in self.segments)
         rows = np.zeros((len(self.segments), powers + 2 * waves, self.width))
@@ -145,11 +144,10 @@ class Reference:
             hz[place, : len(segment.hz)] = segment.hz
             rows[place, powers::2][: len(segment.hz)] = segment.sines
             rows[place, powers + 1 :: 2][: len(segment.hz)] = segment.cosines
-        reference.width, reference.changes = self.width, len(self.since_ns)
-        reference.powers, reference.waves = powers, waves
-        reference.since_ns = memory.integers(self.since_ns or [0])
-        reference.is_zero = memory.integers([segment.is_zero for segment in self.segments])
-        reference.hz, reference.rows = memory.reals(hz if waves else [0.0]), memory.reals(rows)
+        return {
+            "width": self.width, "changes": len(self.since_ns), "powers": powers, "waves": waves,
+            "since_ns": np.array(self.since_ns, np.int64), "hz": hz, "rows": rows,
+        }  # fmt: skip
 
 
 class ReferenceInForce:
@@ -165,6 +163,8 @@ class ReferenceInForce:
         self._zero = Reference.constant(np.zeros(n), np.zeros(m))
         self.reference = reference or self._zero
         self._last = self.reference
+        self._before: list[Reference] = []
+        """What models of the core may still follow."""
 
     @property
     def moves(self) -> bool:
@@ -188,6 +188,7 @@ class ReferenceInForce:
         reference = reference or self._zero
         if not reference.is_constant or np.array_equal(_row(reference), _row(self._last)):
             return False  # a reference that moves cannot change
+        self._before.append(self.reference)
         self.reference, self._last = self.reference.then(since_ns, reference), reference
         return True
 

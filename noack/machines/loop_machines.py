@@ -3,7 +3,7 @@
 A driver in C (live, in virtual time, in replay) makes the steps. A step calls this class where it
 needs Python: users' code, changes of settings. The driver returns when there are rows to take.
 
-What a role describes of each machine is a *part*: it fills the core's structure, and answers the
+What a role describes of each machine is a *part*: it gives the machine's settings, and answers the
 questions of a step (``enum noack_question`` in native/loop/public.h).
 
 The loops may have vectors of different sizes. The rows of a table then have room for the longest;
@@ -13,7 +13,7 @@ what a loop's own row lacks is missing in them (:func:`row_layout`).
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import NamedTuple, NoReturn, TypeVar
 from weakref import proxy
 
@@ -21,9 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NEVER_NS
-from noack.core.core_library import CData, CoreMemory, StructRows, core, dtype_of, ffi, pointer_to
+from noack.core.core_library import (
+    CData,
+    Reals,
+    StructRows,
+    core,
+    ffi,
+    new_handle,
+    new_structure,
+    pointer_to,
+    rows_at,
+    set_fields,
+)
 from noack.core.errors import CallerError
-from noack.core.periods import NO_PERIOD, Period
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.roles import External, Notice, Record
 from noack.protocol.wire_format import Flow
@@ -34,16 +44,13 @@ NewRows = Callable[[int, "np.dtype[np.void]"], StructRows]
 """Returns memory for a number of rows of a type."""
 _ROWS, _ROWS_OF_A_LOOP, _MOST_ROWS = 1024, 256, 16_384
 """Rows of each table: at least, for each loop, and at most for all loops."""
-_NOTES = 256
-"""Notes for which there is room until rows are taken."""
 
 
 class Role(NamedTuple):
     """What the machines of a process have in common."""
 
     name: str
-    structure: str
-    """Name of the core's structure of one machine, and of the field of ``noack_process``."""
+    """What it is, and the core's ``noack_NAME``."""
     receives: Flow
     tables: tuple[str | None, str | None, str | None]
     """The record's tables of ticks, messages and acknowledgements."""
@@ -54,6 +61,27 @@ class Role(NamedTuple):
     def number(self) -> int:
         """The role's number in the core."""
         return int(getattr(core, f"NOACK_{self.name.upper()}"))
+
+
+class TransitionMatrices:
+    """The models of the machines of a process; loops with the same H share their matrices."""
+
+    def __init__(self) -> None:
+        self._shared: dict[bytes, CData] = {}
+
+    def of(self, H: Reals, steps_ns: Iterable[int] = ()) -> CData:
+        """Return the ``noack_transitions *`` of H, (n, n), which lives as long as this object.
+
+        The matrices of ``steps_ns`` are computed at once, so that first deadlines are not delayed.
+        """
+        H = np.array(H, np.float64, order="C")
+        key = H.tobytes()
+        if key not in self._shared:
+            self._shared[key] = new_handle("transitions", len(H), pointer_to(H, "double *"))
+        for step_ns in steps_ns if H.any() else ():
+            if step_ns > 0:
+                core.noack_transition(self._shared[key], step_ns)
+        return self._shared[key]
 
 
 class MachinePart(ABC):
@@ -79,12 +107,12 @@ class MachinePart(ABC):
         return None
 
     @abstractmethod
-    def fill(self, structure: CData, memory: CoreMemory) -> None:
-        """Fill the core's structure, at the start of the machine's work."""
+    def settings(self, models: TransitionMatrices) -> Mapping[str, object]:
+        """Return the fields of the core's structure that are not 0, without the drawn ones."""
 
     @abstractmethod
-    def set_drawn_values(self, structure: CData, memory: CoreMemory) -> None:
-        """Set what the draws determine, in a copy of another loop's structure."""
+    def drawn_settings(self) -> Mapping[str, object]:
+        """Return the fields that the draws determine; loops may differ in them alone."""
 
     @abstractmethod
     def answer(self, question: int, structure: CData) -> Sequence[Notice]:
@@ -116,26 +144,6 @@ def parts_of(
     for number, (loop, first) in enumerate(zip(loops, templates, strict=True)):
         parts.append(part(loop) if number == first else with_draws(parts[first], loop))
     return parts, templates
-
-
-def set_machine(
-    machine: CData,
-    *,
-    n: int,
-    m: int,
-    entries: int,
-    flow: Flow,
-    period: Period | None = None,
-    horizon_ns: int,
-) -> None:
-    """Fill a new ``noack_machine``; its ticks begin at time 0."""
-    machine.n, machine.m = n, m
-    machine.period, machine.horizon_ns = NO_PERIOD if period is None else period.core, horizon_ns
-    machine.reached_ns, machine.change_ns = -1, NEVER_NS
-    machine.received.flow, machine.received.entries = flow, entries
-    machine.acknowledgements.flow = Flow.ACKNOWLEDGEMENT
-    for reception in (machine.received, machine.acknowledgements):
-        reception.newest, reception.not_after_ns = -1, horizon_ns
 
 
 def take_changes(
@@ -173,78 +181,59 @@ class LoopMachines:
         self.parts = tuple(parts)
         self.role = self.parts[0].role
         self.phases_ns = tuple(phases_ns or (0,) * len(self.parts))
-        self.memory = CoreMemory()
-        """What the structures refer to."""
+        self._models = TransitionMatrices()
         self._notices: list[Notice] = []
         self._failure: BaseException | None = None
         self.before_answer: Callable[[MachinePart], None] | None = None
         """Called before a part answers a question."""
-        self.core: CData = self.memory.keep(ffi.new("noack_process *"))
-        """The ``noack_process``; its address does not change."""
-        self._fill_machines(templates or range(len(self.parts)))
+        self.machines = self._new_machines(templates or range(len(self.parts)))
+        """The ``noack_plant``, ``noack_sensor`` or ``noack_controller`` of each loop."""
         self._inspected_loops = {k for k, part in enumerate(self.parts) if part.counts_every_message}
         """Loops of which every message may matter."""
-        self._message = ffi.new("noack_message *")
-        self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
         self._tables: dict[int, StructRows] = {}
         self._new_rows: NewRows = np.empty
-        most = min(_ROWS_OF_A_LOOP * len(self.parts), _MOST_ROWS)
-        self._fill_tables(rows or max(_ROWS, most))
-        wrong = core.noack_process_check(self.core)
-        if wrong != ffi.NULL:
-            raise ValueError(f"{self.role.name}: {ffi.string(wrong).decode()}")
-        core.noack_process_begin(self.core)
-
-    def _fill_machines(self, templates: Sequence[int]) -> None:
-        process, count, keep = self.core, len(self.parts), self.memory.keep
-        process.role, process.loops = self.role.number, count
-        machines = keep(ffi.new(f"{self.role.structure}[]", count))
-        setattr(process, f"{self.role.name}s", machines)
-        process.heap = keep(ffi.new("noack_heap_entry[]", count))
-        self.machines: CData = machines
-        """(loops,) The structures of the machines."""
-        copies: dict[int, list[int]] = {}
-        for number, first in enumerate(templates):
-            copies.setdefault(first, []).append(number)
-        for first, (_, *others) in copies.items():
-            mark = self.memory.mark
-            self.parts[first].fill(machines[first], self.memory)
-            if others:
-                self.memory.copy(machines, first, others, mark)
-            for number in others:
-                if self.parts[number] is not self.parts[first]:
-                    self.parts[number].set_drawn_values(machines[number], self.memory)
         this = proxy(self)  # what the core calls must not keep these machines alive
-        ask = keep(ffi.callback(
+        self._ask = ffi.callback(
             "int64_t(int64_t, int64_t)", lambda *asked: this._answer(*asked), error=1,
             onerror=lambda *failed: this._keep_failure(*failed),
-        ))  # fmt: skip
-        for loop, (structure, phase_ns) in enumerate(zip(machines, self.phases_ns, strict=True)):
-            structure.machine.phase_ns, structure.machine.loop, structure.machine.ask = phase_ns, loop, ask
+        )  # fmt: skip
+        most = min(_ROWS_OF_A_LOOP * len(self.parts), _MOST_ROWS)
+        self.core: CData = self._new_process(rows or max(_ROWS, most))
+        """The ``noack_process``."""
 
-    def _fill_tables(self, rows: int) -> None:
-        self.core.notes = pointer_to(self._notes, "noack_note *")
-        self.core.note_places = len(self._notes)
+    def _new_machines(self, templates: Sequence[int]) -> list[CData]:
+        kind, machines = f"noack_{self.role.name}", list[CData]()
+        for loop, (part, first) in enumerate(zip(self.parts, templates, strict=True)):
+            if loop == first:
+                settings = new_structure(kind, part.settings(self._models))
+            else:
+                settings = ffi.new(f"{kind} *", machines[first][0])
+            if loop == first or part is not self.parts[first]:
+                set_fields(settings, part.drawn_settings())
+            settings.machine.phase_ns = self.phases_ns[loop]
+            machines.append(new_handle(self.role.name, settings))
+        return machines
+
+    def _new_process(self, rows: int) -> CData:
         shapes = [part.shape for part in self.parts]
         types = row_types(shapes)
+        kinds = {shape: number for number, shape in enumerate(dict.fromkeys(shapes))}
+        kind_of = np.array([kinds[shape] for shape in shapes])
+        given, layouts = ffi.new("noack_table[]", core.NOACK_TABLES), list[NDArray[np.int64]]()
         for number, name in enumerate(self.role.tables):
             if name is None or name not in types:
                 continue
-            table = self.core.tables[number]
-            table.row_bytes, table.places = types[name].itemsize, rows
-            self._renew_table(number, np.empty(rows, types[name]))
-            if len(set(shapes)) > 1:
-                table.layouts = self._layouts(name, types[name], shapes)
-
-    def _layouts(self, name: str, table_type: np.dtype[np.void], shapes: Sequence[RecordShape]) -> CData:
-        """Return the layout of each loop's rows in a table; loops of a shape share it."""
-
-        @cache
-        def layout(shape: RecordShape) -> CData:
-            loop_type = tables(**asdict(shape)).get(name)
-            return ffi.NULL if loop_type is None else self.memory.integers(row_layout(loop_type, table_type))
-
-        return self.memory.keep(ffi.new("int64_t *[]", [layout(shape) for shape in shapes]))
+            table, of_table = given[number], types[name]
+            self._tables[number] = np.empty(rows, of_table)
+            table.rows = pointer_to(self._tables[number], "uint8_t *")
+            table.row_bytes, table.places = of_table.itemsize, rows
+            if len(kinds) > 1:
+                rows_of = [tables(**asdict(kind)).get(name) for kind in kinds]
+                layouts.append(np.array([row_layout(own, of_table) for own in rows_of]))
+                table.kinds, table.layouts = len(kinds), pointer_to(layouts[-1], "int64_t *")
+                table.kind_of = pointer_to(kind_of, "int64_t *")
+        machines = ffi.new("noack_machine *[]", [ffi.addressof(own.machine) for own in self.machines])
+        return new_handle("process", self.role.number, len(machines), machines, self._ask, given)
 
     def take_rows_from(self, new_rows: NewRows) -> None:
         """Let ``new_rows`` provide the memory of the rows, from before the first step on."""
@@ -271,10 +260,9 @@ class LoopMachines:
                 part.external.connect()
 
     def raise_failure(self) -> NoReturn:
-        """Raise the exception of the answer for lack of which a step was not done."""
+        """Raise the exception of the answer for lack of which a step was not done, or MemoryError."""
         failure, self._failure = self._failure, None
-        assert failure is not None
-        raise failure
+        raise failure or MemoryError
 
     def _answer(self, loop: int, question: int) -> int:
         """Do what a step needs before it goes on; the core calls this. Return 0."""
@@ -308,7 +296,7 @@ class LoopMachines:
                 batches.append((name, new))
                 if number == core.NOACK_MESSAGES:
                     self._inspect(new)
-        for note in self._notes[: self.core.note_count]:
+        for note in rows_at(self.core.notes, self.core.note_count):
             loop = int(note["loop"])
             self._keep_notices(loop, (self.parts[loop].note(note),))
         self.core.note_count = 0
@@ -391,18 +379,19 @@ def _row_types(shape: RecordShape) -> Mapping[str, np.dtype[np.void]]:
     return {name: np.dtype([(LOOP, "<u2"), *kind.descr]) for name, kind in types.items()}
 
 
-def row_layout(loop_type: np.dtype[np.void], table_type: np.dtype[np.void]) -> NDArray[np.int64]:
+def row_layout(loop_type: np.dtype[np.void] | None, table_type: np.dtype[np.void]) -> NDArray[np.int64]:
     """Return which word of a loop's own row each word of a table's row is.
 
     A vector of the loop is the beginning of the table's; the rest of it is NaN. A column that the
     loop does not have is 0.
 
     Args:
-        loop_type: the row type of the loop, without its number.
+        loop_type: the row type of the loop, without its number; None: it has no such table.
         table_type: the row type of the table, with the number of the loop.
     """
     layout = np.full((table_type.itemsize - core.NOACK_LOOP_BYTES) // 8, core.NOACK_MISSING_ZERO)
-    for name in loop_type.names or ():
+    for name in () if loop_type is None else loop_type.names or ():
+        assert loop_type is not None
         assert loop_type.fields is not None
         assert table_type.fields is not None
         (kind, begin), (table_kind, table_begin) = loop_type.fields[name][:2], table_type.fields[name][:2]

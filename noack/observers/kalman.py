@@ -21,8 +21,8 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.core_library import core, pointer_to, reals_at
+from noack.core.linear_systems import Matrix
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
 from noack.settings.section import Deviations, MatrixRows, require_length, require_shape
 
@@ -116,28 +116,20 @@ class KalmanSettings(ObserverSettings):
         return np.asarray(np.linalg.solve(C @ predicted @ C.T + R, C @ predicted).T)
 
     def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
-        memory, observer = CoreMemory(), ffi.new("noack_observer *")
         (n, m), p = assumed.Bd.shape, len(assumed.C)
-        self.fill(observer, assumed, np.zeros(n), memory)
-        nothing = memory.zeros(max(p, m))
+        observer = self.observer(assumed, {})
+        zeros = np.zeros(max(p, m))
+        nothing = pointer_to(zeros, "double *")
         while True:
-            core.noack_observer_gain(observer, n)
+            core.noack_observer_gain(observer)
             yield reals_at(observer.gain, n, p).copy()
-            core.noack_observer_correct(observer, n, nothing)
+            core.noack_observer_correct(observer, nothing)
             for _ in range(assumed.steps):
-                core.noack_observer_predict(observer, n, m, nothing)
+                core.noack_observer_predict(observer, nothing)
 
-    def fill(self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
-        super().fill(observer, assumed, x, memory)
-        memory.fill(
-            observer,
-            {
-                "kind": core.NOACK_KALMAN,
-                "P": np.diag(np.square(self.initial_std)),
-                "Q": assumed.Q,
-                "R": assumed.R,
-            },
-        )
+    def numbers(self, assumed: EstimationModel) -> dict[str, object]:
+        covariances = {"P": np.diag(np.square(self.initial_std)), "Q": assumed.Q, "R": assumed.R}
+        return {"kind": core.NOACK_KALMAN} | covariances
 
 
 def _require_covariance(key: str, rows: MatrixRows | None, *, definite: bool) -> None:

@@ -11,9 +11,9 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import FiniteFloat, model_validator
 
-from noack.core.core_library import CData, CoreMemory, core
+from noack.core.core_library import core
 from noack.core.errors import CallerError
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings, observer_gain
 from noack.settings.section import MatrixRows, require_shape
 
@@ -88,8 +88,7 @@ class LuenbergerSettings(ObserverSettings):
         gain = np.array(self.gain)
         return chain([gain if self.first_gain is None else np.array(self.first_gain)], repeat(gain))
 
-    def fill(self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
-        super().fill(observer, assumed, x, memory)
+    def numbers(self, assumed: EstimationModel) -> dict[str, object]:
         first = None if self.first_gain is None else np.array(self.first_gain)
         gains = {"gain": np.array(self.gain), "first_gain": first}
-        memory.fill(observer, {"kind": core.NOACK_LUENBERGER, **gains})
+        return {"kind": core.NOACK_LUENBERGER} | gains

@@ -6,12 +6,12 @@ observability of a pair (A, C), and pole placement for an observer.
 """
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from noack.core.core_library import CData, CoreMemory
+from noack.core.core_library import CData, new_handle, new_structure
 from noack.core.linear_systems import Matrix, Vector
 from noack.settings.section import Row, ScenarioSection, Table, require_length
 
@@ -98,13 +98,17 @@ class ObserverSettings(ScenarioSection):
     def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
         """Yield L of every measurement, (n, p), without end."""
 
-    def fill(self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
-        """Fill all of a ``noack_observer`` but its kind, with x̂ before the first measurement."""
-        n, p = len(assumed.Ad), len(assumed.C)
-        memory.fill(observer, {
-            "p": p, "Ad": assumed.Ad, "Bd": assumed.Bd, "C": assumed.C, "x": x, "t_ns": -1,
-            "gain": np.zeros((n, p)), "scratch": np.zeros(3 * n * n + n * p + p * p + 2 * n + p),
-        })  # fmt: skip
+    @abstractmethod
+    def numbers(self, assumed: EstimationModel) -> dict[str, object]:
+        """Return the fields of a ``noack_observer`` that differ between the kinds."""
+
+    def observer(self, assumed: EstimationModel, estimate: Mapping[str, object]) -> CData:
+        """Return a new ``noack_observer`` with the fields of its estimate."""
+        n, m = assumed.Bd.shape
+        model = {"n": n, "m": m, "p": len(assumed.C), "Ad": assumed.Ad, "Bd": assumed.Bd, "C": assumed.C}
+        return new_handle(
+            "observer", new_structure("noack_observer", model | self.numbers(assumed) | {**estimate})
+        )
 
 
 def unobservable_mode(A: Matrix, C: Matrix, *, stable_too: bool = False) -> complex | None:

@@ -21,7 +21,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import CData, CoreMemory, core
+from noack.core.core_library import CData, core, new_handle, new_structure
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 
@@ -253,51 +253,32 @@ _LATEST_NS = 2**60
 """The core's longest time; no run is as long."""
 
 
-def fill_rule(structure: CData, rule: TriggerRule, n: int, memory: CoreMemory) -> None:
-    """Fill a ``noack_trigger_rule`` for n states; its matrices live in ``memory``.
+def new_rule(rule: TriggerRule, n: int) -> CData:
+    """Return a new ``noack_trigger_rule`` for n states.
 
     Raises:
         ValueError: the rule is for another number of states.
     """
     dynamic, forecast = rule.dynamic_variable, rule.forecast
-    memory.fill(structure, {
-        "level": rule.level, "rate_per_s": rule.rate_per_s, "floor": rule.floor, "since_ns": rule.since_ns,
-        "from_event": rule.from_event, "integrates": rule.integrates,
+    numbers: dict[str, object] = {
+        "n": n, "level": rule.level, "rate_per_s": rule.rate_per_s, "floor": rule.floor,
+        "since_ns": rule.since_ns, "from_event": rule.from_event, "integrates": rule.integrates,
         "is_dynamic": dynamic is not None, "initial": rule.initial_dynamic_variable,
         "decay_per_s": 0.0 if dynamic is None else dynamic.decay_per_s,
         "grid_ns": _whole_ns(rule.grid_ns), "idle_ns": _whole_ns(rule.idle_ns),
         "shortest_ns": _whole_ns(rule.shortest_ns), "longest_ns": _whole_ns(rule.longest_ns),
         "forecasts": forecast is not None, "weight": rule.weight,
-        "forecast_weight": None if forecast is None else rule.weight,
-    })  # fmt: skip
+    }  # fmt: skip
     if forecast is not None:
-        memory.fill(
-            structure,
-            {
-                "beta": forecast.beta,
-                "alpha_per_s": forecast.alpha_per_s,
-                "forecast_floor": forecast.floor,
-                "growth_per_s": forecast.growth_per_s,
-                "mismatch_per_s": forecast.mismatch_per_s,
-                "disturbance_per_s": forecast.disturbance_per_s,
-            },
-        )
-    forms = {"": rule.form, "_gain": None if dynamic is None else dynamic.gain}
-    for suffix, form in forms.items():
-        for name in QuadraticForm._fields:
-            matrix = None if form is None else getattr(form, name)
-            if matrix is not None and matrix.shape[1] != 2 * n:
+        thresholds = forecast._asdict()
+        numbers |= {"forecast_weight": rule.weight, "forecast_floor": thresholds.pop("floor")} | thresholds
+    for suffix, form in (("", rule.form), ("_gain", None if dynamic is None else dynamic.gain)):
+        for name, matrix in () if form is None else form._asdict().items():
+            if matrix.shape[1] != 2 * n:
                 raise ValueError(f"trigger: expected {2 * n} columns, found {matrix.shape[1]}")
-            setattr(structure, f"{name}{suffix}_rows", 0 if matrix is None else len(matrix))
-            if matrix is not None and len(matrix):
-                setattr(structure, f"{name}{suffix}", memory.reals(matrix))
-
-
-def rule_rows(rule: TriggerRule) -> int:
-    """Return the rows of a rule's longest matrix; at least the number of states."""
-    dynamic, n = rule.dynamic_variable, rule.form.positive.shape[1] // 2
-    matrices = [*rule.form, *(() if dynamic is None else dynamic.gain)]
-    return int(max(n, *map(len, matrices)))
+            rows = len(matrix)
+            numbers |= {f"{name}{suffix}": matrix if rows else None, f"{name}{suffix}_rows": rows}
+    return new_handle("trigger_rule", new_structure("noack_trigger_rule", numbers))
 
 
 def _whole_ns(t_ns: float) -> int:

@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 
 from cosim.simulation.exact_simulation import ExactSimulation, run_with_events
 from noack.core import core_library
-from noack.core.core_library import CoreMemory, core, ffi, load_core, new_handle
+from noack.core.core_library import core, load_core, new_handle, new_structure
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger_policies.trigger_rule import TriggerRule, fill_rule
+from noack.trigger_policies.trigger_rule import TriggerRule, new_rule
 from tests.cosim.simulation.exact_populations import random_population, random_setting
 from tests.helpers.example_rules import TABLES, area_rule, decaying_rule, random_rule
 from tests.helpers.machine_parts import SteppedMachines
 from tests.helpers.wire_decoder import NO_VECTOR
-from tests.noack.machines.any_machines import MS, Sizes, controller, plant, sensor, set_number, sizes, text_of
+from tests.noack.machines.any_machines import MS, Sizes, controller, plant, sensor, sizes, with_number
 
 pytestmark = pytest.mark.sanitized
 
@@ -29,32 +29,23 @@ VALUES = (0.0, -0.0, 1.0, -3.7, 1e154, 1e308, -1e308, 5e-324, np.inf, -np.inf, n
 WHOLE = (0, 1, -1, 7, MS, 2**40, 2**60, 2**61, 2**62 - 1, 2**62, 2**63 - 1, -(2**63))
 """Some of them are admitted."""
 
-_MACHINE = tuple(
-    f"machine.{name}"
-    for name in ("phase_ns", "first_ns", "period.ns", "period.part", "period.parts", "horizon_ns",
-                 "step", "inputs", "reached_ns", "change_ns")
-)  # fmt: skip
+_MACHINE = tuple(f"machine.{name}" for name in ("first_ns", "horizon_ns"))
 NUMBERS_OF = {
-    "plant": (
-        *_MACHINE, "input_period.ns", "input_period.part", "input_period.parts", "timeout_ns",
-        "notice_ns", "newest_ns", "newest_sequence",
-        "fallback_ns", "fallback_sequence", "missing_ns", "measurements", "watchdog",
-    ),
+    "plant": (*_MACHINE, "timeout_ns", "notice_ns", "watchdog"),
     "sensor": (
-        *_MACHINE, "timeout_ns", "model_ns", "has_state", "events", "wait_ns", "rule.from_event",
-        "rule.integrates", "rule.is_dynamic", "rule.forecasts", "rule.grid_ns", "rule.idle_ns",
-        "rule.shortest_ns", "rule.longest_ns", "trigger.since_ns", "trigger.earliest_ns",
-        "trigger.latest_ns", "trigger.measured_ns", "trigger.event_ns",
+        "machine.horizon_ns", "timeout_ns", "has_state", "rule.from_event", "rule.integrates",
+        "rule.is_dynamic", "rule.forecasts", "rule.grid_ns", "rule.idle_ns", "rule.shortest_ns",
+        "rule.longest_ns",
     ),
-    "controller": (*_MACHINE, "model_ns", "has_state", "newest", "acknowledges"),
+    "controller": (*_MACHINE, "has_state", "acknowledges", "timeout_ns", "holds_input"),
 }  # fmt: skip
 """Fields that are no sizes of arrays."""
+PERIODS = ("machine.period", "input_period")
 REALS = (
     *(f"rule.{name}" for name in (
         "level", "rate_per_s", "floor", "decay_per_s", "initial", "beta", "alpha_per_s",
         "forecast_floor", "growth_per_s", "mismatch_per_s", "disturbance_per_s",
     )),
-    "trigger.level", "trigger.auxiliary", "trigger.rate",
 )  # fmt: skip
 """Of a sensor."""
 
@@ -148,17 +139,21 @@ def test_large_machines_run_clean(
 def test_machines_of_any_numbers_are_refused_or_run_clean(
     role: str, of: Sizes, seed: int, given_inputs: list[Any], data: st.DataObject
 ) -> None:
-    own = machines_of(role, [(of, seed)], 1.0)
+    (part,) = machines_of(role, [(of, seed)], 1.0).parts
     changed = st.tuples(st.sampled_from(NUMBERS_OF[role]), st.sampled_from(WHOLE))
-    for name, value in data.draw(st.lists(changed, max_size=3)):
-        set_number(own, name, value)
+    numbers: list[Any] = data.draw(st.lists(changed, max_size=3))
     if role == "sensor":
-        changed_reals = st.tuples(st.sampled_from(REALS), st.sampled_from(VALUES))
-        for name, real in data.draw(st.lists(changed_reals, max_size=3)):
-            set_number(own, name, real)
-    if text_of(own) is not None:
+        numbers += data.draw(st.lists(st.tuples(st.sampled_from(REALS), st.sampled_from(VALUES)), max_size=3))
+    else:
+        periods = st.tuples(st.sampled_from(WHOLE), st.sampled_from(WHOLE), st.sampled_from(WHOLE))
+        names = PERIODS if role == "plant" else PERIODS[:1]
+        numbers += data.draw(st.lists(st.tuples(st.sampled_from(names), periods), max_size=1))
+    for name, value in numbers:
+        part = with_number(part, name, value)
+    try:
+        own = SteppedMachines([part], [data.draw(st.sampled_from(WHOLE))])
+    except ValueError:
         return
-    core.noack_process_begin(own.core)
     with np.errstate(all="ignore"):
         drive(own, given_inputs)
 
@@ -221,7 +216,7 @@ def test_batches_with_impossible_numbers_or_sizes_are_refused() -> None:
         ("shortest_ns", -1), ("longest_ns", -1), ("longest_ns", 2**63 - 1), ("idle_ns", -(2**63)),
         ("decay_per_s", -1.0),
     ):  # fmt: skip
-        with pytest.raises(ValueError, match="a trigger rule"):
+        with pytest.raises(ValueError, match="trigger rule"):
             exact_simulation(identity, trigger, {}, **{field: value})
 
 
@@ -229,10 +224,9 @@ def exact_simulation(
     identity: np.ndarray, trigger: TriggerRule, numbers: dict[str, Any], **of_rule: float
 ) -> Any:
     """A simulation of these numbers, and of a rule with others."""
-    settings, memory = ffi.new("noack_exact_settings *"), CoreMemory()
-    fill_rule(settings.rule, trigger, 2, memory)
-    plain = {"n": 2, "m": 2, "H": identity, "K": identity, "horizon_s": 1.0, "known_start": True}
-    memory.fill(settings, plain | numbers)
+    rule = new_rule(trigger, 2)
     for name, value in of_rule.items():
-        setattr(settings.rule, name, value)
-    return new_handle("exact", settings)
+        setattr(rule, name, value)
+    rule = new_handle("trigger_rule", rule)
+    plain = {"n": 2, "m": 2, "H": identity, "K": identity, "horizon_s": 1.0, "known_start": True}
+    return new_handle("exact", new_structure("noack_exact_settings", plain | {"rule": rule} | numbers))

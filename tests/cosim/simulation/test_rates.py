@@ -10,7 +10,6 @@ import pytest
 import noack
 from cosim.analysis.replay import replay
 from cosim.simulation.virtual_time import simulate
-from noack.core.core_library import core
 from noack.core.periods import MOST_PARTS, period_of
 from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario_file import validate
@@ -49,8 +48,8 @@ def test_no_step_drifts_within_the_longest_run(rate_hz: float) -> None:
     for k in steps:
         expected = int(exact_times(rate_hz, 1, k)[0])
         machine.step = k
-        core.noack_process_begin(machines.core)
-        assert period.time_ns(k) == machines.core.heap[0].due_ns == expected
+        process = machines._new_process(1)
+        assert period.time_ns(k) == process.heap[0].due_ns == expected
         assert period.last_until(expected) == k
         assert period.last_until(expected - 1) == k - 1 if k else True
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from noack.core.core_library import CoreMemory, reals_at
+from noack.core.core_library import _ARRAYS, ffi, new_structure, reals_at, set_fields
 from noack.core.number_format import at_least, at_most, plus_minus
 from noack.core.random_streams import stream, stream_key, stream_keys, uniforms, words
 
@@ -84,20 +84,31 @@ def test_a_mean_has_as_many_digits_as_its_interval_supports(
     assert plus_minus(mean, halfwidth) == written
 
 
-# --- arrays that live as long as their memory -----------------------------------------------------
+# --- structures with arrays ------------------------------------------------------------------------
 
 
-def test_arrays_are_copies_that_live_with_their_memory() -> None:
-    memory, given = CoreMemory(), np.arange(6.0).reshape(2, 3).T
-    pointer, whole = memory.reals(given), memory.integers([3, -1])
-    shown = reals_at(pointer, 3, 2)
+def test_arrays_are_copies_that_live_with_their_structure() -> None:
+    given = np.arange(6.0).reshape(2, 3).T
+    numbers = {"changes": 2, "hz": given, "since_ns": np.array([3, -1]), "is_zero": None}
+    structure = new_structure("noack_reference", numbers)
+    shown = reals_at(structure.hz, 3, 2)
     given[:] = 0
     gc.collect()
     assert shown.tolist() == [[0.0, 3.0], [1.0, 4.0], [2.0, 5.0]]
-    assert (whole[0], whole[1]) == (3, -1)
+    assert (structure.since_ns[0], structure.since_ns[1], structure.changes) == (3, -1, 2)
+    assert structure.is_zero == ffi.NULL
     shown[0, 1] = 7.0  # shares the memory
-    assert pointer[1] == 7.0
-    assert reals_at(memory.zeros(0), 0).tolist() == []
+    assert structure.hz[1] == 7.0
+    assert len(_ARRAYS[structure]) == 2
+    arrays = len(_ARRAYS)
+    del structure
+    assert len(_ARRAYS) == arrays - 1
+
+
+def test_fields_of_inner_structures_are_set_and_replaced() -> None:
+    plant = new_structure("noack_plant", {"machine": {"n": 3, "period": (5, 0, 1)}, "x": np.ones(3)})
+    set_fields(plant, {"x": np.full(3, 2.0), "noise": {"width": 1}})
+    assert (plant.machine.n, plant.machine.period.ns, plant.x[2], plant.noise.width) == (3, 5, 2.0, 1)
 
 
 @pytest.mark.parametrize(("value", "most", "least"), [

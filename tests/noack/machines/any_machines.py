@@ -1,7 +1,7 @@
 """Random machines with every kind of setting: the same numbers make the same machine."""
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from controller_node.controller import Controller
 from noack.controllers.controller_settings import ControlFailedError
 from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.clock import NEVER_NS
-from noack.core.core_library import core, ffi
+from noack.core.core_library import ffi, new_handle
 from noack.core.linear_systems import Matrix, Vector, norm, product
 from noack.core.periods import Period
 from noack.core.references import Reference, ReferenceSegment
@@ -351,20 +351,50 @@ def _plain(output: Output, numbered: bool) -> Any:
     return output.table, [np.asarray(entry).tobytes() for entry in row]
 
 
-def text_of(own: LoopMachines) -> str | None:
-    """What the core refuses; None if nothing."""
-    text = core.noack_process_check(own.core)
-    return None if text == ffi.NULL else ffi.string(text).decode()
+def with_number(part: Plant | Sensor | Controller, path: str, value: Any) -> Any:
+    """Give a machine another number than its settings have, also one of a rule or reference in it.
+
+    Raises:
+        ValueError: the core refuses the number there.
+    """
+    name, *way = re.findall(r"\w+", path)
+    settings, drawn_settings = part.settings, part.drawn_settings
+
+    def changed(given: Mapping[str, Any]) -> Mapping[str, Any]:
+        given = dict(given)
+        if name not in given:
+            return given
+        given[name] = _with_number(given[name], way, value)
+        part.kept = given[name]  # type: ignore[union-attr]
+        return given
+
+    part.settings = lambda models: changed(settings(models))  # type: ignore[method-assign]
+    part.drawn_settings = lambda: changed(drawn_settings())  # type: ignore[method-assign]
+    return part
 
 
-def set_number(own: LoopMachines, path: str, value: Any) -> None:
-    """Set a field of the process or, if it has none of that name, of its machine."""
-    first, *_ = re.split(r"[.\[]", path)
-    owner = own.core if hasattr(own.core, first) else own.machines[0]
-    *way, last = re.findall(r"\w+", path)
-    for name in way:
-        owner = owner[int(name)] if name.isdigit() else getattr(owner, name)
-    if last.isdigit():
-        owner[int(last)] = value
+def _with_number(owner: Any, way: Sequence[str], value: Any) -> Any:
+    """Return what has another number at the end of a way, as far as it is a handle a new one."""
+    if not way:
+        return value
+    name, *rest = way
+    if isinstance(owner, Mapping):
+        return {**owner, name: _with_number(owner.get(name), rest, value)}
+    pointer = owner
+    for inner in way[:-1]:
+        pointer = getattr(pointer, inner)
+    if way[-1].isdigit():
+        pointer[int(way[-1])] = value
     else:
-        setattr(owner, last, value)
+        setattr(pointer, way[-1], value)
+    kind = ffi.typeof(owner).item.cname
+    return new_handle(kind.removeprefix("noack_"), owner)
+
+
+def refusal_of(part: Any) -> str | None:
+    """What the core refuses of a machine; None if nothing."""
+    try:
+        LoopMachines([part])
+    except ValueError as error:
+        return str(error)
+    return None

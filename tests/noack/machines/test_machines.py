@@ -2,7 +2,7 @@
 
 import re
 import weakref
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller_node.controller import Controller
-from noack.core.core_library import ffi
+from noack.core.core_library import ffi, new_handle, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.core.references import Reference, ReferenceSegment
-from noack.machines.loop_machines import LoopMachines, row_types
+from noack.machines import loop_machines
+from noack.machines.loop_machines import LoopMachines, row_layout, row_types
 from noack.protocol.record_tables import LOOP, tables
 from noack.protocol.roles import Record
 from noack.protocol.wire_format import Flow, Message
@@ -39,10 +40,10 @@ from tests.noack.machines.any_machines import (
     observer,
     plain,
     plant,
+    refusal_of,
     sensor,
-    set_number,
     sizes,
-    text_of,
+    with_number,
 )
 
 Part = Plant | Sensor | Controller
@@ -162,42 +163,35 @@ def test_machines_live_no_longer_than_they_are_used() -> None:
 
 # --- wrong numbers --------------------------------------------------------------------------------
 
-SOURCE = Path(__file__).parents[3] / "native" / "loop" / "machine_check.c"
+ROOM = Path(__file__).parents[3] / "native" / "loop"
 NULL, FAR, HUGE = ffi.NULL, 2**60 + 1, 2**63 - 1
 OF = Sizes(3, 2, 2, 2, 2, carries_model=True, acknowledged=True, disturbed=(True, True))
-
 WRONG = Path(__file__).with_name("wrong_numbers.txt")
 """Machines of any numbers are in tests/native."""
-NOT_ACKNOWLEDGED = "a sensor waits for acknowledgements and has none"
 
 
-def machines_of(role: str) -> LoopMachines:
+def full_part(role: str) -> Any:
     """A machine with as many parts as one can have."""
     if role == "plant":
-        own = LoopMachines([plant(next(_full_plants()), OF)])
-    elif role == "sensor":
-        part = sensor(0, OF, form=list(TABLES).index("dynamic"))
-        part.observer = observer(next(_kalman()), 2, 3, 2, 2, 1.0)
-        own = LoopMachines([part])
-        memory, model = own.memory, own.machines[0].model
-        rows = [np.zeros((1, 5)), np.ones((2, 5)), np.zeros((1, 5))]
-        waves = np.ones((1, 5))
-        segments = [
-            ReferenceSegment(begin_ns, row, np.ones(1), waves, waves)
-            for begin_ns, row in zip([0, 20 * MS, 30 * MS], rows, strict=True)
-        ]
-        Reference(segments, 3).fill(model.reference, memory)
-    else:
-        own = LoopMachines([controller(next(_with_point()), OF)])
-    assert text_of(own) is None
-    return own
+        return plant(next(_full_plants()), OF)
+    if role == "controller":
+        return controller(next(_with_point()), OF)
+    rows, waves = [np.zeros((1, 5)), np.ones((2, 5)), np.zeros((1, 5))], np.ones((1, 5))
+    segments = [
+        ReferenceSegment(begin_ns, row, np.ones(1), waves, waves)
+        for begin_ns, row in zip([0, 20 * MS, 30 * MS], rows, strict=True)
+    ]
+    part = sensor(0, OF, form=list(TABLES).index("dynamic"))
+    return replace(
+        part, observer=observer(next(_kalman()), 2, 3, 2, 2, 1.0), reference=Reference(segments, 3)
+    )
 
 
 def _full_plants() -> Any:
     for seed in range(100):
         part = plant(seed, OF)
         assert part.measurement is not None
-        if part.measurement.is_noisy and part.watchdog.carries_model:
+        if part.measurement.is_noisy and part.measurement.C is not None:
             yield seed
 
 
@@ -216,31 +210,78 @@ def test_each_wrong_number_is_refused_with_the_approved_text() -> None:
     def refusal(line: str) -> list[str]:
         field, _, value = line.partition(" = ")
         role, _, path = field.partition(" ")
-        own = machines_of(role)
-        set_number(own, path, eval(value, {"NULL": NULL, "FAR": FAR, "HUGE": HUGE}))
-        return [str(text_of(own))]
+        assert refusal_of(full_part(role)) is None
+        given_value = eval(value, {"NULL": NULL, "FAR": FAR, "HUGE": HUGE})
+        return [str(refusal_of(with_number(full_part(role), path, given_value)))]
 
     compare_lines(WRONG, refusal)
 
 
-def test_a_sensor_that_waits_without_acknowledgements_is_refused() -> None:
-    own = LoopMachines([sensor(0, Sizes(1, 1), form=0)])
-    own.machines[0].sent_count = 1
-    assert text_of(own) == NOT_ACKNOWLEDGED
+def test_every_text_of_the_constructors_is_in_the_approved_file() -> None:
+    sources = "".join(file.read_text() for file in ROOM.glob("*.c"))
+    texts = re.findall(r'"((?:an?|the) [a-z][^"]+)"', sources)
+    approved = [line.partition(": ")[2] for line in WRONG.read_text().splitlines() if line.startswith("    ")]
+    assert {*texts} - {*approved} == ELSEWHERE
+    assert len(ELSEWHERE) + len({*approved}) == len({*texts})
 
 
-def test_every_text_of_the_machine_check_is_in_the_approved_file() -> None:
-    texts = re.findall(r'(?:return|:) "([^"]+)"', SOURCE.read_text())
-    approved = {line.strip() for line in WRONG.read_text().splitlines() if line.startswith("    ")}
-    assert approved | {NOT_ACKNOWLEDGED} == {*texts}
+ELSEWHERE = {
+    "a process has no role, no loops or nobody to ask",
+    "the rows of a table do not have the size that the machines write",
+    "a model needs 1 to 64 states",
+    "a model has no matrix",
+}
+"""Texts about what no machine has in its settings: tested below."""
+
+
+def test_a_phase_out_of_range_is_refused() -> None:
+    for phase_ns in (-1, FAR):
+        with pytest.raises(ValueError, match="phase"):
+            LoopMachines([controller(1, Sizes(1, 1))], [phase_ns])
+
+
+def test_models_of_wrong_sizes_are_refused() -> None:
+    for n, H, text in ((0, np.eye(1), "1 to 64"), (65, np.eye(65), "1 to 64"), (2, None, "no matrix")):
+        with pytest.raises(ValueError, match=text):
+            new_handle("transitions", n, ffi.NULL if H is None else pointer_to(H, "double *"))
+
+
+def test_processes_of_wrong_numbers_are_refused() -> None:
+    own = LoopMachines([controller(1, Sizes(1, 1)), controller(2, Sizes(3, 1))])
+    machines = ffi.new("noack_machine *[]", [ffi.addressof(handle.machine) for handle in own.machines])
+
+    def process(*, role: int = 2, loops: int = 2, ask: Any = own._ask, **of_table: Any) -> Any:
+        tables = ffi.new("noack_table[]", [own.core.tables[number] for number in range(3)])
+        for name, value in of_table.items():
+            setattr(tables[0], name, value)
+        return new_handle("process", role, loops, machines, ask, tables)
+
+    process()
+    for numbers in ({"role": 3}, {"role": -1}, {"loops": 0}, {"loops": 65536}, {"ask": ffi.NULL}):
+        with pytest.raises(ValueError, match="no role, no loops or nobody"):
+            process(**numbers)  # type: ignore[arg-type]
+    row_bytes = own.core.tables[0].row_bytes
+    for of_table in (
+        {"rows": ffi.NULL}, {"places": 0}, {"places": HUGE}, {"row_bytes": HUGE}, {"row_bytes": -1},
+        {"row_bytes": row_bytes + 1}, {"row_bytes": row_bytes - 8}, {"layouts": ffi.NULL},
+        {"kind_of": ffi.NULL}, {"kinds": 1}, {"kinds": -1},
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="rows of a table"):
+            process(**of_table)
 
 
 @pytest.mark.parametrize("word", [-3, 11])
-def test_a_layout_with_a_word_that_the_machine_does_not_write_is_refused(word: int) -> None:
-    own = LoopMachines([controller(1, Sizes(1, 1)), controller(2, Sizes(3, 1))])
-    assert text_of(own) is None
-    own.core.tables[0].layouts[0][4] = word
-    assert text_of(own) == "the rows of a table do not have the size that the machines write"
+def test_a_layout_with_a_word_that_the_machine_does_not_write_is_refused(
+    word: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def layout(*of: Any) -> Any:
+        words = row_layout(*of)
+        words[4] = word
+        return words
+
+    monkeypatch.setattr(loop_machines, "row_layout", layout)
+    with pytest.raises(ValueError, match="rows of a table"):
+        LoopMachines([controller(1, Sizes(1, 1)), controller(2, Sizes(3, 1))])
 
 
 def test_a_machine_that_the_core_refuses_raises_its_text() -> None:
