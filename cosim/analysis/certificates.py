@@ -172,6 +172,7 @@ class Certificates:
         progress: Callable[[float], None] = lambda share: None,
         most_work: float = MOST_WORK,
         conditions: Sequence[str] = ("ideal", "schedule"),
+        near: Sequence[Mapping[str, object]] = (),
     ) -> Witnesses:
         """Search for bounds that the checker proves; they take the place of computed ones.
 
@@ -179,12 +180,13 @@ class Certificates:
             progress: called with the completed share.
             most_work: limit of each search, see :class:`noack.theory.witnesses.effort.Effort`.
             conditions: "ideal" for the paper's conditions, and "schedule" for the scenario's own.
+            near: documents of similar scenarios; the search begins near them.
         """
         scenario, late_periods, *_, nonlinear, equations = self._arguments
         if (other := nonlinear or equations) is not None:
-            found = find_region_witnesses(other, late_periods, progress, most_work, conditions)
+            found = find_region_witnesses(other, late_periods, progress, most_work, conditions, near)
         else:
-            found = find_witnesses(scenario, late_periods, progress, most_work, conditions)
+            found = find_witnesses(scenario, late_periods, progress, most_work, conditions, near)
         proven = {(s.plants, s.conditions): s.bounds for s in found.statements if s.bounds is not None}
         self.__setstate__((proven, found.unproven))
         return found

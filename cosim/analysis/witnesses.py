@@ -90,6 +90,7 @@ def find_witnesses(
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
     conditions: Sequence[str] = ("ideal", "schedule"),
+    near: Sequence[Mapping[str, object]] = (),
 ) -> Witnesses:
     """Search for witnesses of a resolved scenario's bounds, for its plant and its uncertainty box.
 
@@ -99,6 +100,7 @@ def find_witnesses(
         progress: called with the completed share.
         most_work: limit of each search, see :class:`noack.theory.witnesses.effort.Effort`.
         conditions: "ideal" and "schedule", or one of them.
+        near: documents of similar scenarios.
     """
     content = resolved_content(resolved, late_periods)
     has_box = resolved.plant.uncertainty_A is not None or resolved.plant.uncertainty_B is not None
@@ -106,10 +108,11 @@ def find_witnesses(
     found: list[WitnessedStatement] = []
     for index, (plants, under) in enumerate(wanted):
         part = partial(_part_of, progress, index, len(wanted))
-        near = []  # the searches of ideal conditions are short
+        known = []  # the searches of ideal conditions are short
         if under == "schedule":
-            near = [s.document for s in found if s.document and (s.plants == plants or s.conditions == under)]
-        found.append(find_statement(content, plants, under, part, most_work, near))
+            found_near = (s for s in found if s.plants == plants or s.conditions == under)
+            known = [*near, *(s.document for s in found_near if s.document)]
+        found.append(find_statement(content, plants, under, part, most_work, known))
     progress(1.0)
     return Witnesses(content, found)
 
@@ -120,12 +123,13 @@ def find_region_witnesses(
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
     conditions: Sequence[str] = ("ideal", "schedule"),
+    near: Sequence[Mapping[str, object]] = (),
 ) -> Witnesses:
     """Search for witnesses of a plant's equations, as :func:`find_witnesses` for a linear plant."""
     content, found = resolved_content(resolved, late_periods), []
     for index, under in enumerate(conditions):
         part = partial(_part_of, progress, index, len(conditions))
-        found.append(find_region_statement(resolved, content, under, part, most_work))
+        found.append(find_region_statement(resolved, content, under, part, most_work, near))
     progress(1.0)
     return Witnesses(content, found)
 
@@ -220,12 +224,13 @@ def find_region_statement(
     conditions: str,
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
+    near: Sequence[Mapping[str, object]] = (),
 ) -> WitnessedStatement:
     """Search for the witness of a plant's equations on a region; see :func:`find_statement`."""
     try:
         plant = plant_on_regions(resolved, content, conditions)
         witness, loop = known_or_found_on_region(
-            plant, progress, most_work, has_outputs=conditions == "schedule"
+            plant, progress, most_work, has_outputs=conditions == "schedule", near=near
         )
     except (RefusedError, NoWitnessError, NotEnclosedError) as error:
         return WitnessedStatement("region", conditions, None, None, str(error))
@@ -275,6 +280,7 @@ def known_or_found_on_region(
     most_work: float,
     *,
     has_outputs: bool = True,
+    near: Sequence[Mapping[str, object]] = (),
 ) -> tuple[Witness, Loop]:
     """Return the witness of a plant on a region, as :func:`known_or_found`, and the loop there.
 
@@ -282,18 +288,20 @@ def known_or_found_on_region(
         NoWitnessError: none was found.
         NotEnclosedError: the equations have no enclosure near 0.
     """
-    equations, near = plant.on(_NEAR * plant.typical)
-    outputs, ultimate = _wanted(near, has_outputs=has_outputs)
+    equations, loop = plant.on(_NEAR * plant.typical)
+    outputs, ultimate = _wanted(loop, has_outputs=has_outputs)
 
     def search() -> Witness:
-        return find_region_witness(plant, outputs, ultimate=ultimate, progress=progress, most_work=most_work)
+        return find_region_witness(
+            plant, outputs, ultimate=ultimate, near=near, progress=progress, most_work=most_work
+        )
 
     def loop_on(document: Mapping[str, object]) -> Loop:
-        region = read_region(document, near.n, near.B.ncols())
+        region = read_region(document, loop.n, loop.B.ncols())
         widths = [np.inf if limit is None else float(limit) for limit in (*region.x, *region.u)]
         return plant.on(np.array(widths))[1]
 
-    store = WitnessStore((near, equations.document))
+    store = WitnessStore((loop, equations.document))
     witness = _known_or_found(
         store, outputs, ultimate, most_work, search, lambda document: prove(loop_on(document), document)
     )

@@ -58,6 +58,8 @@ from noack.trigger_policies.decaying import DecayingSettings
 
 _FLOOR_SHARE = 0.05
 """The floor of the threshold, as a share of beta."""
+_LARGEST_FLOOR_SHARE = 0.5
+"""The largest floor that is tried for the allowed errors, as a share of beta."""
 _FASTEST_ALPHA_PER_S = 1.0
 """α is at most this, unless allowed errors ask for a fast loop."""
 _RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0, 250.0, 500.0)
@@ -246,6 +248,20 @@ def _require_rest(model: LinearModel) -> None:
         )
 
 
+def _next_floor(floor: float, share: float, largest: float) -> float:
+    """Return the floor to try next, or the same again.
+
+    Args:
+        floor: the last one.
+        share: the largest share of an allowed error that its bound has in the end; infinite without a bound.
+        largest: the largest floor.
+    """
+    if _LEAST_USE <= share <= 1.0:
+        return floor
+    factor = _MOST_USE / share if math.isfinite(share) else _FLOOR_SHARE
+    return min(to_digits(floor * factor, 2), largest)
+
+
 def _initial_state(model: LinearModel, fixed_state: object) -> Vector:
     """Return x(0): as given, the plant's own, or 0.1 for each state that is no other's rate."""
     n, unit = model.plant.n, np.eye(model.plant.n)
@@ -354,22 +370,26 @@ class _TrialScenarios:
     def with_threshold(self, trial: _Trial, report: Callable[[str], None]) -> tuple[_Trial, Certificates]:
         """Return the trial with the last threshold that the allowed errors need, and its certificates.
 
-        A bound that does not decay is proportional to this threshold, where nothing disturbs the plant.
+        It begins with the largest one. A bound that does not decay is proportional to this threshold, where
+        nothing disturbs the plant; friction adds to it.
         """
         is_fixed = not self._fixed_settings.keys().isdisjoint(("trigger", "trigger.floor"))
+        used = self.scenario(trial).trigger
+        largest = None  # of the floors
+        if self._allowed and not is_fixed and isinstance(used, DecayingSettings):
+            largest = to_digits(_LARGEST_FLOOR_SHARE * used.beta, 2)
+            trial = replace(trial, floor=largest)
+        near: list[Mapping[str, object]] = []
         for number in range(_MOST_THRESHOLDS):
             report(f"searching for proofs{f': threshold {number + 1}' if number else ''}")
             results = certificates_of(self.scenario(trial), of_model=True)
             most_work = 2 * RUN_WORK if self.is_linear else MOST_WORK
-            results.prove(most_work=most_work, conditions=("schedule",))
-            used = results.scenario.trigger
-            if results.guaranteed is None or is_fixed or not isinstance(used, DecayingSettings):
+            found = results.prove(most_work=most_work, conditions=("schedule",), near=near)
+            near = [each.document for each in found.statements if each.document is not None]
+            if largest is None or number == _MOST_THRESHOLDS - 1:
                 break
-            largest = self.largest_share(results)
-            if _LEAST_USE <= largest <= 1.0 or number == _MOST_THRESHOLDS - 1:
-                break
-            wanted = to_digits(min(used.floor * _MOST_USE / largest, used.beta / 2), 2)
-            if wanted == used.floor:
+            wanted = _next_floor(trial.floor or largest, self.largest_share(results), largest)
+            if wanted == trial.floor:
                 break
             trial = replace(trial, floor=wanted)
         return trial, results

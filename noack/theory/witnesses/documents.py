@@ -150,14 +150,25 @@ def _confirmed(
     raise NoWitnessError("errors: the sensor's error may be larger than each guess of it")
 
 
-def coarse_sizes(loop: Loop, outputs: Sequence[str], effort: Effort, shares: "Shares") -> list[float]:
-    """Return rough bounds of outputs at all times, which are at most little too small.
+class RoughBounds(NamedTuple):
+    """Bounds that are not proven."""
+
+    sizes: Sequence[float]
+    """Of the outputs at all times, at most little too small."""
+    document: Mapping[str, object]
+    """With each output's ν, for the search of a similar loop."""
+
+
+def rough_bounds(
+    loop: Loop, outputs: Sequence[str], near: Sequence[Mapping[str, object]], effort: Effort
+) -> RoughBounds:
+    """Return rough bounds of outputs at all times.
 
     Args:
         loop: the loop.
         outputs: the outputs.
+        near: documents of similar loops, as :func:`find_witness` has them.
         effort: counts the work.
-        shares: for ν of outputs, from a similar loop; those of this one replace them.
 
     Raises:
         NoWitnessError: some output has none.
@@ -165,12 +176,14 @@ def coarse_sizes(loop: Loop, outputs: Sequence[str], effort: Effort, shares: "Sh
     rates = _Rates(loop)
     if rates.slowest <= 0:
         raise NoWitnessError("the loop does not decay without losses")
+    shares = rates.shares(near)
     if loop.times.period > 0 or not compares_error(loop):
         document = without_drift(loop, first_assumptions(loop, rates.rate))
         search = _OutputSearch(loop, rates, document, shares, effort, is_rough=True)
     else:
         _, search = _confirmed(loop, rates, effort, shares, is_rough=True)
-    return [search.best_share(output, starts=True)[1].size for output in outputs]
+    sizes = [search.best_share(output, starts=True)[1].size for output in outputs]
+    return RoughBounds(sizes, {"rate": rates.rate, "bounds": search.decays()})
 
 
 def _by_quadratic_forms(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) -> Witness:
@@ -396,6 +409,13 @@ class _OutputSearch:
             self._shares[key] = best
         return self._best[key]
 
+    def decays(self) -> list[dict[str, object]]:
+        """Return for each output that was searched its ν, as in the entry of a document."""
+        return [
+            {"output": output, "from_start": starts, "decay": self._rates.decay(share)}
+            for (output, starts), (share, _) in self._best.items()
+        ]
+
     def has_solution(self, output: str) -> bool:
         """Return whether the solver finds forms that bound an output from the start on."""
         try:
@@ -435,8 +455,11 @@ class _OutputSearch:
         return found
 
     def _is_direct(self, output: str, *, starts: bool) -> bool:
-        """Return whether each solution is an accurate one: few are tried."""
-        is_known = (output, starts) in self._known and not self._is_rough
+        """Return whether each solution is an accurate one: few are tried.
+
+        With friction the first coordinates are too far off: a margin there costs much of the bound.
+        """
+        is_known = (output, starts) in self._known and not self._is_rough and not self._loop.along
         return is_known or self._templates.work(output) > _LARGE
 
     def _solve(

@@ -13,8 +13,9 @@ import numpy as np
 from noack.core.linear_systems import Vector
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations
 from noack.theory.witnesses.coordinates import floats
-from noack.theory.witnesses.documents import Shares, Witness, coarse_sizes, find_witness
+from noack.theory.witnesses.documents import RoughBounds, Witness, find_witness, rough_bounds
 from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
+from noack_check.equations import read_region
 from noack_check.loop import Loop
 
 _FIRST = 0.1
@@ -46,6 +47,7 @@ def find_region_witness(
     outputs: Sequence[str] = ("x", "e_c"),
     *,
     ultimate: Sequence[str] = (),
+    near: Sequence[Mapping[str, object]] = (),
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
 ) -> Witness:
@@ -55,6 +57,8 @@ def find_region_witness(
         plant: the plant.
         outputs: those that are bounded from the start on.
         ultimate: those that are bounded in the limit t → ∞.
+        near: documents of the same plant with other thresholds: the search begins with the region of the
+            first one.
         progress: called with the completed share.
         most_work: limit of the search, see :class:`Effort`.
 
@@ -65,13 +69,15 @@ def find_region_witness(
     effort.expect(_EXPECTED)
     restricted = _restricted(plant)
     coordinates = [_output(plant, k) for k in restricted]
-    widths = (
-        _own_bounds_inside(plant, restricted, effort) if restricted else np.full_like(plant.typical, np.inf)
-    )
+    widths = np.full_like(plant.typical, np.inf)
+    if restricted:
+        first = _first_region(plant, restricted, near)
+        widths, rough = _own_bounds_inside(plant, restricted, first, near, effort)
+        near = [*near, rough]
     why: NoWitnessError | None = None
     for _ in range(_LAST_TRIES):
         try:
-            return _witness(plant, widths, [*outputs, *coordinates], ultimate, progress, most_work)
+            return _witness(plant, widths, [*outputs, *coordinates], ultimate, near, progress, most_work)
         except WorkLimitError:
             raise
         except NoWitnessError as error:
@@ -79,18 +85,36 @@ def find_region_witness(
     raise NoWitnessError(f"{_described(plant, widths)}: {why}")
 
 
-def _own_bounds_inside(plant: PlantOnRegions, restricted: Sequence[int], effort: Effort) -> Vector:
-    """Return a region that contains the rough bounds that follow from it.
+def _first_region(
+    plant: PlantOnRegions, restricted: Sequence[int], near: Sequence[Mapping[str, object]]
+) -> Vector:
+    """Return the region with which the search begins: that of a document, or a small one."""
+    for document in near:
+        if isinstance(table := document.get("region"), Mapping):
+            region = read_region({"region": table}, plant.states, len(plant.names) - plant.states)
+            limits = [*region.x, *region.u]
+            if all(limits[k] is not None for k in restricted):
+                return _with(plant, restricted, np.array([float(limits[k] or 0.0) for k in restricted]))
+    return _with(plant, restricted, _FIRST * plant.typical[restricted])
+
+
+def _own_bounds_inside(
+    plant: PlantOnRegions,
+    restricted: Sequence[int],
+    widths: Vector,
+    near: Sequence[Mapping[str, object]],
+    effort: Effort,
+) -> tuple[Vector, Mapping[str, object]]:
+    """Return a region that contains the rough bounds that follow from it, and their document.
 
     Raises:
         NoWitnessError: none is found; the message names the region that the bounds from x(0) need.
     """
     coordinates = [_output(plant, k) for k in restricted]
-    widths = _with(plant, restricted, _FIRST * plant.typical[restricted])
-    reached, shares = np.zeros(len(restricted)), Shares()
+    reached = np.zeros(len(restricted))
     for attempt in range(_MOST_REGIONS):
         try:
-            last, reached = reached, _reached(plant, widths, coordinates, effort, shares)
+            last, rough = reached, _rough_bounds(plant, widths, coordinates, near, effort)
         except WorkLimitError:
             raise
         except NoWitnessError as error:
@@ -99,9 +123,10 @@ def _own_bounds_inside(plant: PlantOnRegions, restricted: Sequence[int], effort:
             raise NoWitnessError(
                 f"the bounds from x(0) need a larger region than there is: {error}"
             ) from None
+        reached, near = np.array(rough.sizes), [rough.document]
         if (reached < widths[restricted]).all():
             if (reached > _TIGHT * widths[restricted]).any():
-                return widths
+                return widths, rough.document
             widths = _with(plant, restricted, _WIDER * reached)  # inside it the bounds are not larger
             continue
         grown = _WIDER * _extrapolated(last, reached, widths[restricted])
@@ -114,6 +139,7 @@ def _witness(
     widths: Vector,
     outputs: Sequence[str],
     ultimate: Sequence[str],
+    near: Sequence[Mapping[str, object]],
     progress: Callable[[float], None],
     most_work: float,
 ) -> Witness:
@@ -122,6 +148,7 @@ def _witness(
         loop,
         outputs,
         ultimate=ultimate,
+        near=near,
         progress=lambda share: progress((1 + share) / 2),
         most_work=most_work,
     )
@@ -135,17 +162,17 @@ def region_table(widths: Vector, states: int) -> Mapping[str, object]:
     return {"x": limits[:states], "u": limits[states:]}
 
 
-def _reached(
+def _rough_bounds(
     plant: PlantOnRegions,
     widths: Vector,
     outputs: Sequence[str],
+    near: Sequence[Mapping[str, object]],
     effort: Effort,
-    shares: Shares,
-) -> Vector:
+) -> RoughBounds:
     """Return bounds of x and u, where they have to be in a region, by the plants that enclose it there."""
     _, loop = _on(plant, widths)
     try:
-        return np.array(coarse_sizes(loop, outputs, effort, shares))
+        return rough_bounds(loop, outputs, near, effort)
     except WorkLimitError:
         raise
     except NoWitnessError as error:
