@@ -370,15 +370,15 @@ class _TrialScenarios:
     def with_threshold(self, trial: _Trial, report: Callable[[str], None]) -> tuple[_Trial, Certificates]:
         """Return the trial with the last threshold that the allowed errors need, and its certificates.
 
-        It begins with the largest one. A bound that does not decay is proportional to this threshold, where
-        nothing disturbs the plant; friction adds to it.
+        A bound that does not decay is proportional to this threshold, where nothing disturbs the plant; of
+        plants that are not linear, friction may be most of it, so the largest threshold is the first.
         """
         is_fixed = not self._fixed_settings.keys().isdisjoint(("trigger", "trigger.floor"))
         used = self.scenario(trial).trigger
         largest = None  # of the floors
         if self._allowed and not is_fixed and isinstance(used, DecayingSettings):
             largest = to_digits(_LARGEST_FLOOR_SHARE * used.beta, 2)
-            trial = replace(trial, floor=largest)
+            trial = replace(trial, floor=used.floor if self.is_linear else largest)
         near: list[Mapping[str, object]] = []
         for number in range(_MOST_THRESHOLDS):
             report(f"searching for proofs{f': threshold {number + 1}' if number else ''}")
