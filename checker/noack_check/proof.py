@@ -38,6 +38,8 @@ MOST_LATER = 8
 _MOST_TESTS = 1_000_000
 _CELLS = 32
 """Parts of the time before the first input."""
+_MOST_TRIES, _WIDER = 20, arb(1.1)
+"""To enclose x in such a part."""
 
 
 class Bound(NamedTuple):
@@ -253,10 +255,13 @@ def _prove_quiet_start(loop: Loop) -> None:
 def error_without_input(loop: Loop, until: fmpq) -> arb:
     """Return a bound of ‖W e_s‖ until a time, if no input acts.
 
-    It begins at a noise, at t = 0 or at an event. Without an input x(t) = e^{At} x(0), and the disturbances
-    add at most t · sup‖e^{As}‖ · ‖D d‖.
+    It begins at a noise, at t = 0 or at an event. Without an input x follows A, pushed by disturbances and,
+    if the plant's entries are not known, by Δx: entries that depend on x, as of equations, vary in time.
+
+    Raises:
+        RejectedError: no bound of x is found.
     """
-    A = loop.A + arb_mat(loop.n, loop.n, [around_zero(h) for h in loop.half_A.entries()])
+    half = arb_mat(loop.n, loop.n, [around_zero(h) for h in loop.half_A.entries()])
     pushes = arb_mat(loop.n, 1)
     if loop.sizes:
         pushes = loop.pushes * arb_mat(len(loop.sizes), 1, [around_zero(size) for size in loop.sizes])
@@ -264,13 +269,26 @@ def error_without_input(loop: Loop, until: fmpq) -> arb:
         pushes += loop.push_before_input
     largest, _ = growth(weighted(loop, arb(0)), arb(until))
     step, x, reached = arb(until) / _CELLS, loop.start, largest * _most_noise(loop)
-    within, forward = (upto(step) * A).exp(), (step * A).exp()
+    within, forward = (upto(step) * loop.A).exp(), (step * loop.A).exp()
     for _ in range(_CELLS):
-        during = within * x + upto(step) * (within * pushes)
-        drift = loop.weight * ((A - loop.H) * during + pushes)
+        during = _during(x, within, upto(step) * within, pushes, half)
+        added = pushes + half * during
+        drift = loop.weight * ((loop.A - loop.H) * during + added)
         reached += step * largest * frobenius(drift)
-        x = forward * x + step * (within * pushes)
+        x = forward * x + step * (within * added)
     return reached
+
+
+def _during(x: arb_mat, within: arb_mat, gained: arb_mat, pushes: arb_mat, half: arb_mat) -> arb_mat:
+    """Enclose x on a cell: what x leads to if it is in an enclosure that contains this is in it (Picard)."""
+    found = within * x + gained * pushes
+    for _ in range(_MOST_TRIES):
+        image = within * x + gained * (pushes + half * found)
+        if all(outer.contains(inner) for outer, inner in zip(found.entries(), image.entries(), strict=True)):
+            return image
+        wider = [arb(entry.mid(), entry.rad() * _WIDER) for entry in image.entries()]
+        found = arb_mat(len(wider), 1, wider)
+    raise RejectedError("times: without an input no bound of x is found")
 
 
 def prove_first_event(loop: Loop, drift: Bound, first: arb, until: fmpq) -> None:

@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 from flint import arb, fmpq
+from scipy.linalg import expm
 
 from noack.theory.witnesses.documents import Witness, find_witness
-from noack_check.balls import identity, number
+from noack_check.balls import identity, matrix, number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Chain, Errors, Model
-from noack_check.proof import prove
+from noack_check.proof import error_without_input, prove
 from tests.checker.runs import exceeded, floats
-from tests.checker.test_witnesses import bounds_of, double_integrator
+from tests.checker.test_witnesses import SCHEDULE, bounds_of, double_integrator
 
 LOOPS = {
     "holds": double_integrator(floor=0.02, level=0.0)._replace(holds=True),
@@ -91,3 +92,20 @@ def test_facts_about_errors_bound_those_of_each_location() -> None:
         "1 later": {"e": [1.0], "w": [pytest.approx(16.5)]},
         "start, 0 later": {"e": [], "w": []},
     }
+
+
+def test_without_an_input_the_error_of_plants_that_vary_in_time_is_bounded() -> None:
+    """Entries of equations depend on x; here they jump between their limits, as a random run has it."""
+    loop = double_integrator(SCHEDULE)._replace(half_A=matrix([[0.3, 0.3], [0.3, 0.3]]))
+    bound = float(error_without_input(loop, fmpq(2)).mid())
+    A, H, x_0 = floats(loop.A), floats(loop.H), floats(loop.start)[:, 0]
+    rng, largest = np.random.default_rng(0), 0.0
+    for _ in range(200):
+        z = np.concatenate([x_0, x_0])
+        for _ in range(40):
+            F = A + 0.3 * rng.choice([-1.0, 1.0], (2, 2))
+            z = expm(0.05 * np.block([[F, 0 * F], [0 * F, H]])) @ z
+            largest = max(largest, float(np.linalg.norm(z[2:] - z[:2])))
+    assert 0.1 * bound < largest < bound
+    with pytest.raises(RejectedError, match="no bound of x"):
+        error_without_input(loop._replace(half_A=matrix([[500.0, 500.0], [500.0, 500.0]])), fmpq(2))
