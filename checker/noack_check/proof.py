@@ -18,7 +18,7 @@ The model assumes a bound of e_s − n ("errors"), and how many events happen wh
 Both are proven from bounds of this model, by induction over the events: all bounds hold up to the next one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -27,6 +27,7 @@ from flint import arb, arb_mat, fmpq
 from noack_check.balls import around_zero, frobenius, identity, is_zero, rows_of, upto
 from noack_check.check import RejectedError, verify
 from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
+from noack_check.gains import Gains
 from noack_check.loop import Loop, Noise, Region, Smooth, Times
 from noack_check.model import Chain, Errors, Model, thresholds
 from noack_check.noise import noise_of
@@ -77,8 +78,8 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
         raise RejectedError("not a table")
     rate = read_number(document, "rate")
     assumed = read_assumptions(loop, rate, document)
-    entries = _entries(document, "bounds")
-    if not entries:
+    entries = _entries(document, "bounds") if "bounds" in document or "gains" not in document else []
+    if not entries and "gains" not in document:
         raise RejectedError("bounds: there is none")
     if len({(str(e.get("output")), bool(e.get("from_start", True))) for e in entries}) < len(entries):
         raise RejectedError("bounds: an output occurs twice")
@@ -100,18 +101,31 @@ def conclude(
         apart, first = _times_between_events(loop, rate, proven["drift"], assumed, document)
         bounds.append(sensor_error(loop, rate, proven["drift"]))
     sensor = bounds[-1] if "drift" in proven else proven.get("e_s")
-    is_quiet = require_few_at_start(loop, assumed)
-    require_few_later(loop, assumed, apart if is_quiet else None)
+    gains = Gains(loop, rate, read_table(document, "gains")) if "gains" in document else None
+    by_gains = None if gains is None else _apart_by_gains(gains, read_table(document, "gains"))
+    if of_forms:
+        is_quiet = require_few_at_start(loop, assumed)
+        require_few_later(loop, assumed, apart if is_quiet else None)
+    else:
+        is_quiet = _is_quiet(loop, by_gains)
+    if by_gains is not None:
+        apart = by_gains if apart is None else apart.max(by_gains)
+        first = by_gains if first is None else first.max(by_gains)
     if assumed.errors is not None:
         _require_errors(loop, rate, proven, assumed.errors)
     if loop.region is not None:
-        _require_region(loop.region, proven)
+        _require_region(loop.region, proven, {} if gains is None else gains.bounds)
     if assumed.chain is not None and sensor is not None:
         jumps = assumed.chain.factor(loop.losses, 1 + assumed.later if loop.times.delay > 0 else 0)
         noise = noise_of(loop, rate).sizes
         decaying = sensor.decaying + jumps * (sensor.decaying + noise[0])
         constant = sensor.constant + jumps * (sensor.constant + noise[1])
         bounds.append(Bound("e_c", decaying, constant, True))
+    if gains is not None:
+        bounds += [Bound(output, *sizes, True) for output, sizes in gains.bounds.items()]
+        if loop.needs_constant and rate > 0:  # then what the start adds is in f₁
+            of_state = [pair for pair in gains.bounds.items() if pair[0][0] in "xy"]
+            bounds += [Bound(output, arb(0), constant, False) for output, (_, constant) in of_state]
     if not all(size.is_finite() for bound in bounds for size in (bound.decaying, bound.constant)):
         raise RejectedError("bounds: not finite")
     return Proof(rate, tuple(_about(loop, bound) for bound in bounds), apart, first, is_quiet)
@@ -126,6 +140,32 @@ def _about(loop: Loop, bound: Bound) -> Bound:
     if "[" in output:
         row = rows_of(row, [int(output[2:-1])])
     return bound._replace(constant=bound.constant + loop.offset * spectral_norm(row))
+
+
+def _apart_by_gains(gains: Gains, table: Mapping[str, object]) -> arb | None:
+    """Return a least time between any two events, as proven; None: the document states none.
+
+    With v = e^{−rt}, ‖W (e_s − n)‖ reaches at most a v + b, and the threshold is max(c v, f): see
+    :func:`_prove_inter_event`.
+    """
+    if "inter_event_s" not in table:
+        return None
+    apart = read_number(table, "inter_event_s")
+    _require_silent(gains.loop, apart)
+    decaying, constant = gains.reached(apart)
+    if apart > 0:
+        _require_below(gains.loop, gains.rate, lambda v: decaying * v + constant, is_decaying=constant == 0)
+    return apart
+
+
+def _is_quiet(loop: Loop, apart: arb | None) -> bool:
+    """Return whether it is proven that no event follows the one at t = 0 before the first input acts."""
+    if apart is not None and apart >= arb(loop.times.start):
+        return True
+    try:
+        return require_few_at_start(loop, Assumptions(None, 0, 0, None))
+    except RejectedError:
+        return False
 
 
 class Assumptions(NamedTuple):
@@ -388,24 +428,38 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
     and the integral of ‖W e^{(H+r)s} W⁻¹‖. This is convex in v, and the threshold max(c v, f) piecewise
     affine: its ends and its kink suffice.
     """
+    _require_silent(loop, apart)
     if apart == 0:
         return
-    rule = loop.rule
-    if rule.always or not compares_error(loop) or not apart > 0:
-        raise RejectedError("inter_event_s: not proven for this rule; 0 is")
     largest, total = growth(weighted(loop, rate), apart)
     noise = [(largest + 1) * size for size in noise_of(loop, rate).sizes]
+
+    def reached(v: arb) -> arb:
+        by_drift = (drift.decaying**2 * v**2 + drift.constant**2).sqrt() * total
+        return by_drift + noise[0] * v + noise[1]
+
+    _require_below(loop, rate, reached, is_decaying=drift.constant == 0 and noise[1] == 0)
+
+
+def _require_silent(loop: Loop, apart: arb) -> None:
+    """Require that events need the comparison of ‖W e_s‖, if a time between them is stated."""
+    if apart != 0 and (loop.rule.always or not compares_error(loop) or not apart > 0):
+        raise RejectedError("inter_event_s: not proven for this rule; 0 is")
+
+
+def _require_below(loop: Loop, rate: arb, reached: Callable[[arb], arb], *, is_decaying: bool) -> None:
+    """Require that what e_s reaches, a convex function of v = e^{−rt}, is below the threshold max(c v, f).
+
+    ``is_decaying``: it is a multiple of v.
+    """
+    rule = loop.rule
     level = rule.level if bool(rate == rule.rate) else arb(0)
     kinks = [arb(0), arb(1)]
     if level > 0 and rule.floor > 0:
         kinks.append(rule.floor / level)
     for v in kinks:
-        if v > 1:
-            continue
-        reached = (drift.decaying**2 * v**2 + drift.constant**2).sqrt() * total
-        reached += noise[0] * v + noise[1]
-        is_nothing = v == 0 and rule.floor == 0 and drift.constant == 0 and noise[1] == 0
-        if not (reached < (level * v).max(rule.floor) or is_nothing):
+        is_nothing = v == 0 and rule.floor == 0 and is_decaying
+        if not v > 1 and not (reached(v) < (level * v).max(rule.floor) or is_nothing):
             raise RejectedError("inter_event_s: an event may come earlier")
 
 
@@ -489,7 +543,9 @@ def _require_errors(loop: Loop, rate: arb, proven: Mapping[str, Bound], errors: 
         raise RejectedError("errors: the sensor's error may exceed them")
 
 
-def _require_region(region: Region, proven: Mapping[str, Bound]) -> None:
+def _require_region(
+    region: Region, proven: Mapping[str, Bound], by_gains: Mapping[str, tuple[arb, arb]]
+) -> None:
     """Prove that x and u stay in the region: their bounds are below its limits, strictly.
 
     Up to some time they are in it; so all bounds hold, also at this time, since x is continuous and no
@@ -499,10 +555,15 @@ def _require_region(region: Region, proven: Mapping[str, Bound]) -> None:
         for index, limit in enumerate(limits):
             if limit is None:
                 continue
-            if (bound := proven.get(f"{kind}[{index}]")) is None:
-                raise RejectedError(f"region: {kind}[{index}] has no bound from the start on")
-            if not (bound.decaying**2 + bound.constant**2).sqrt() < limit:
-                raise RejectedError(f"region: {kind}[{index}] may leave it")
+            name, sizes = f"{kind}[{index}]", []
+            if name in proven:
+                sizes.append((proven[name].decaying ** 2 + proven[name].constant ** 2).sqrt())
+            if name in by_gains:
+                sizes.append(sum(by_gains[name], arb(0)))
+            if not sizes:
+                raise RejectedError(f"region: {name} has no bound from the start on")
+            if not any(size < limit for size in sizes):
+                raise RejectedError(f"region: {name} may leave it")
 
 
 def share_of_errors(loop: Loop, rate: arb, drift: Bound, errors: Errors) -> arb:

@@ -117,13 +117,15 @@ def smallest_bounds(proof: Proof) -> list[Bound]:
     smallest: dict[tuple[str, bool], Bound] = {}
     for bound in proof.bounds:
         key = (bound.output, bound.from_start)
-        if key not in smallest or size(bound) < size(smallest[key]):
+        if key not in smallest or size(bound, proof.rate) < size(smallest[key], proof.rate):
             smallest[key] = bound
     return list(smallest.values())
 
 
-def size(bound: Bound) -> float:
-    """Return the bound at t = 0, as it is printed, or a size of one in the limit."""
+def size(bound: Bound, rate: arb) -> float:
+    """Return the bound at t = 0, as it is printed, or what is left of one in the limit."""
+    if not bound.from_start and rate > 0:
+        return float(bound.constant.mid())
     return float((bound.decaying + bound.constant).mid())
 
 

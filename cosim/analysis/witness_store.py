@@ -19,7 +19,7 @@ from flint import arb, arb_mat
 from noack.core.file_access import create_folder, new_file, open_regular, remove_file
 from noack_check.loop import Loop
 
-_FORM = "1"
+_FORM = "2"
 """Of the documents; another one has other keys."""
 _MOST_BYTES, _MOST_FILES = 20_000_000, 300
 _UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError)

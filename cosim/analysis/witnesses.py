@@ -22,7 +22,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import with_stated_times
 from noack.theory.certificates.plant_equations import equations_of
 from noack.theory.certificates.proven_bounds import ProvenBounds
-from noack.theory.witnesses.documents import Witness, find_witness
+from noack.theory.witnesses.documents import Witness, find_witness, witness_by_gains
 from noack.theory.witnesses.effort import MOST_WORK, NoWitnessError
 from noack.theory.witnesses.outward import proven_bounds
 from noack.theory.witnesses.regions import PlantOnRegions, find_region_witness, region_table
@@ -247,9 +247,9 @@ def known_or_found(
     has_outputs: bool = True,
     near: Sequence[Mapping[str, object]] = (),
 ) -> Witness:
-    """Return the witness of a loop that was found earlier, or search for it, unless the limit of work is 0.
+    """Return the witness of a loop that was found earlier, or search for it.
 
-    ``near`` has documents of similar loops.
+    With a limit of work of 0 it is one by gains. ``near`` has documents of similar loops.
 
     Raises:
         NoWitnessError: none was found.
@@ -257,6 +257,8 @@ def known_or_found(
     outputs, ultimate = _wanted(loop, has_outputs=has_outputs)
 
     def search() -> Witness:
+        if not most_work:
+            return witness_by_gains(loop, (*outputs, "e_s", *ultimate))
         return find_witness(
             loop, outputs, ultimate=ultimate, near=near, progress=progress, most_work=most_work
         )
@@ -292,6 +294,8 @@ def known_or_found_on_region(
     outputs, ultimate = _wanted(loop, has_outputs=has_outputs)
 
     def search() -> Witness:
+        if not most_work:
+            raise NoWitnessError("no witness was found earlier")
         return find_region_witness(
             plant, outputs, ultimate=ultimate, near=near, progress=progress, most_work=most_work
         )
@@ -325,7 +329,7 @@ def _known_or_found(
         with suppress(RejectedError, NotEnclosedError):  # it was changed
             return Witness(known.document, proven(known.document))
     if not most_work:
-        raise NoWitnessError("no witness was found earlier")
+        return search()
     try:
         witness = search()
     except NoWitnessError as error:

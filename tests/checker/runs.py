@@ -206,8 +206,9 @@ def _compare(
     u = plant.input_matrix(age) @ xc if age is not None else np.zeros(len(plant.gain))
     motion = plant.A @ x + plant.B @ u + plant.pushes @ np.array(signs)
     values = {"x": x, "e_s": W @ (xs - x), "e_c": W @ (xc - x), "drift": W @ (motion - plant.H @ x)}
+    entries = {"x": x, "u": u, "y": plant.outputs @ x}
     for output, decaying, constant in bounds:
-        value = values[output] if output in values else plant.outputs[[int(output[2:-1])]] @ x
+        value = values[output] if output in values else entries[output[0]][[int(output[2:-1])]]
         added = np.add if output in {"e_s", "e_c"} else np.hypot
         size, bound = float(np.linalg.norm(value)), float(added(decaying * np.exp(-rate * t), constant))
         if size > bound * (1 + _ROUNDING):

@@ -53,6 +53,8 @@ def witness() -> Witness:
 def bounds_of(witness: Witness) -> dict[str, float]:
     sizes: dict[str, float] = {}
     for bound in witness.proof.bounds:
+        if not bound.from_start:
+            continue
         size = math.hypot(float(bound.decaying.mid()), float(bound.constant.mid()))
         sizes[bound.output] = min(size, sizes.get(bound.output, math.inf))
     return sizes

@@ -44,7 +44,7 @@ class Expectations(NamedTuple):
 
 
 def search_limit(loops: int) -> float:
-    """Return the limit of the search for a witness of one loop of a run; 0: many loops use what is known."""
+    """Return the limit of the search for a witness of one loop of a run; 0: what is known, or by gains."""
     return RUN_WORK / loops if loops <= _FEW_LOOPS else 0.0
 
 
@@ -73,7 +73,7 @@ def scheduled_certificates(
         scenario: the scenario, about its set-point.
         start_error: what the input was wrong by until the first input of the controller.
         stated: the scenario with its set-point, if it has one.
-        most_work: limit of the search for a witness; 0: only those are used that are known.
+        most_work: limit of the search for a witness; 0: one that is known, or by gains.
     """
     conditions = allowed_conditions(scenario)
     return certificates_under(

@@ -18,6 +18,7 @@ from noack.theory.witnesses.assumptions import (
 )
 from noack.theory.witnesses.coordinates import floats, simulated_frames
 from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
+from noack.theory.witnesses.gains import find_by_gains, find_gains
 from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.search import FREE, Found, Search, refined
 from noack.theory.witnesses.semidefinite import Accuracy
@@ -26,7 +27,7 @@ from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Model
-from noack_check.proof import Bound, Proof, compares_error, conclude, prove_bound, read_assumptions
+from noack_check.proof import Bound, Proof, compares_error, conclude, prove, prove_bound, read_assumptions
 
 _COARSE = Accuracy(gap=1e-3, feasibility=1e-3, improves_steps=False)
 _ATTEMPTS = (
@@ -83,17 +84,41 @@ def find_witness(
         progress: called with the completed share.
         most_work: limit of the search, see :class:`Effort`.
 
+    Without forms there may be bounds by gains, which take no search.
+
     Raises:
         NoWitnessError: none was found.
     """
+    wanted = _Wanted(outputs, ultimate, near)
+    try:
+        return _by_forms(loop, wanted, Effort(progress, most_work))
+    except NoWitnessError as error:
+        with contextlib.suppress(NoWitnessError):
+            return witness_by_gains(loop, wanted.by_gains)
+        raise error
+
+
+def witness_by_gains(loop: Loop, outputs: Sequence[str]) -> Witness:
+    """Return a witness without forms, in a second.
+
+    Raises:
+        NoWitnessError: nothing is proven by gains.
+    """
+    document = find_by_gains(loop, outputs)
+    try:
+        return Witness(document, prove(loop, document))
+    except RejectedError as error:
+        raise NoWitnessError(str(error)) from None
+
+
+def _by_forms(loop: Loop, wanted: "_Wanted", effort: Effort) -> Witness:
+    """Return a witness with quadratic forms."""
     if loop.losses > _MOST_LOSSES:
         raise NoWitnessError(f"M − 1 = {loop.losses} consecutive losses: at most {_MOST_LOSSES} are searched")
     rates = _Rates(loop)
     if rates.slowest <= 0:
         raise NoWitnessError("the loop does not decay without losses")
-    effort = Effort(progress, most_work)
-    effort.expect(_EXPECTED * (1 + len(outputs) + len(ultimate)))
-    wanted = _Wanted(outputs, ultimate, near)
+    effort.expect(_EXPECTED * (1 + len(wanted.outputs) + len(wanted.ultimate)))
     if loop.times.period > 0 or loop.needs_tests_apart:
         return _by_clock(loop, wanted, effort)
     if not compares_error(loop):
@@ -122,6 +147,11 @@ class _Wanted(NamedTuple):
     ultimate: Sequence[str]
     near: Sequence[Mapping[str, object]]
 
+    @property
+    def by_gains(self) -> Sequence[str]:
+        """The outputs to bound by gains, which have a bound in the limit where they have one."""
+        return *self.outputs, "e_s", *self.ultimate
+
 
 def _by_threshold(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) -> Witness:
     """Return a witness for a rule that compares ‖W e_s‖: its drift bounds e_s and times between events."""
@@ -131,7 +161,7 @@ def _by_threshold(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) 
     drift = float(of_drift.bound.decaying), float(of_drift.bound.constant)
     document["inter_event_s"] = apart = inter_event_s(loop, rates.rate, drift)
     document["first_event_s"] = first_event_s(loop, drift, apart)
-    return search.witness(document, bounds)
+    return search.witness(document, bounds, wanted)
 
 
 def _confirmed(
@@ -191,7 +221,7 @@ def _by_quadratic_forms(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Ef
     document = without_drift(loop, first_assumptions(loop, rates.rate))
     search = _OutputSearch(loop, rates, document, rates.shares(wanted.near), effort)
     sensor = search.bound("e_s")
-    return search.witness(document, [*search.bounds(wanted), sensor])
+    return search.witness(document, [*search.bounds(wanted), sensor], wanted)
 
 
 def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort) -> Witness:
@@ -220,7 +250,7 @@ def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort) -> Witness:
                 continue
             bounds = search.bounds(wanted._replace(outputs=outputs))
             if bounds:
-                return search.witness(document, bounds)
+                return search.witness(document, bounds, wanted)
     raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
 
 
@@ -311,12 +341,17 @@ class _OutputSearch:
         self._best: dict[tuple[str, bool], tuple[float, Found]] = {}
         self._share: float | None = None
 
-    def witness(self, document: Mapping[str, object], proven: Sequence["_Proven"]) -> Witness:
-        """Return the witness of a document with bounds of this search.
+    def witness(
+        self, document: Mapping[str, object], proven: Sequence["_Proven"], wanted: _Wanted
+    ) -> Witness:
+        """Return the witness of a document with bounds of this search, and with those by gains.
 
         Raises:
             NoWitnessError: they do not prove what it assumes.
         """
+        with contextlib.suppress(NoWitnessError):
+            gains = find_gains(self._loop, self._rates.rate, wanted.by_gains)
+            document = {**document, "gains": gains}
         try:
             proof = conclude(self._loop, document, self._assumed, [each.bound for each in proven])
         except RejectedError as error:

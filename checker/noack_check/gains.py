@@ -1,0 +1,382 @@
+r"""Bounds by gains: the paper's chain, and a loop of inequalities between suprema.
+
+With p = u − Kx and E = A + BK − H the loop obeys, between events,
+
+    ẋ = (A + BK)x + Bp + ω + Dd,    ė_s = H e_s − (Ex + Bp + ω + Dd),
+
+where ω is what a plant of the box adds, |ω_i| ≤ Σ_j |half_A_ij x_j| + |half_B_ij u_j|. Before the first
+input, which acts within t_a, u = 0 and p = −Kx. In coordinates T of the inputs, p stands for Tp, and B for
+BT⁻¹.
+
+*Units.* A bound is D₁ f₁ + D₂ f₂, f₁ = e^{−rt} and f₂ = 1. The start and the level of the threshold are of
+unit f₁, what is constant of f₂ (and all if f₁ = f₂). Each unit has inequalities of its own. In those of f₁
+every signal is multiplied by e^{rt}, and H, A + BK, A stand for these matrices plus r. In a unit let θ be
+the part of the threshold, and η that of ‖W n‖, where x + n is what the sensor takes for x.
+
+*After a test* ‖W e_s‖ ≤ b = θ + sup ‖N(x + n)‖ + η, whether it was silent, or an event that set e_s := n.
+The next one is at most h later. With a dwell time h is the time from an event on in which none is tested.
+For a periodic rule, which compares nothing, it is that up to the next event, and b = η.
+
+*The controller's error.* Let t_r be the last event whose update acts at t, and v(τ) = e_s(τ) +
+Σ e^{H(τ−t_k)} (e_s(t_k⁻) − n_k) over the events in (t_r, τ]. An event does not change v. So v is continuous,
+v̇ = Hv − (Ex + Bp + ω + Dd), however close the events are, and v(t) = e_c(t). Let σ = max(t − d, t_r). If it
+is t_r, v(σ) = n. Else the events in (t_r, σ] are lost, since they would act in the place of t_r: at most
+M − 1. Go back from σ to the test before it, and from each lost event to the test before it. Then
+
+    |C e_c| ≤ g b + Σ_q ∫₀^{h+d} |C e^{Hs} q| ds · |q̂|
+              + (M − 1) (k (b + η) + Σ_q min(h sup |C e^{Hs} q|, k ∫₀ʰ ‖W e^{Hs} q‖ ds) · |q̂|)
+
+with g and k the suprema of ‖C e^{Hs} W⁻¹‖ up to h + d, and for ever. The sums are over the columns q of B, D,
+and of the identity for ω and Ex, with the suprema |q̂| of p, d, ω and Ex. So neither times between events
+nor numbers of updates on their way are assumed. With a periodic rule t − t_r ≤ Mh + d: v is followed from
+t_r, and nothing is counted as lost.
+
+*The input* is K e^{−Hs} x_c of an age s ≤ a: p = K e^{−Hs} e_c − ∫₀ˢ K e^{−Hτ} H x dτ. With a ball C around
+K e^{−Hs} for all ages, |p_j| ≤ |C_j e_c| + a |C_j H x|.
+
+*The state.* |Cx| ≤ sup |C e^{(A+BK)s} x(0)| + Σ_q ∫ |C e^{(A+BK)s} q| ds · |q̂|. What acts up to t_a only
+adds at most t_a sup |C e^{(A+BK)s} q| |q̂|: p = −Kx, of which x = e^{At} x(0) + … gives a bound.
+
+*Conclusion.* For each signal these are inequalities v_i(t) ≤ (T v)(t) + g_i(t) with a positive linear T of
+the past, which maps y₁f₁ + y₂f₂ to at most F₁y₁ f₁ + F₂y₂ f₂. The solution has y > Fy + g in both units.
+Up to a time there are finitely many events (tests are apart; with tests at all times events are, too: see
+:mod:`.sentences`), and all signals are finite. Let λ be the least number with v ≤ λ(y₁f₁ + y₂f₂) up to this
+time. If λ > 1, then v ≤ λ(Ty + g) is at most λ(1 − ε)(y₁f₁ + y₂f₂) for an ε > 0: a contradiction. So
+v ≤ y₁f₁ + y₂f₂, up to any time. Where the plant is enclosed on a region, this holds up to the time at which
+x or u would leave it, and there it shows that they do not: see :mod:`.proof`.
+"""
+
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from flint import arb, arb_mat
+
+from noack_check.balls import columns_of, identity, is_zero, rows_of, upto, zeros
+from noack_check.check import RejectedError
+from noack_check.document import read_matrix, read_number, read_rows, read_table
+from noack_check.loop import Loop
+from noack_check.model import thresholds
+from noack_check.noise import noise_of
+from noack_check.responses import Decay, Response, norm_of, responses, responses_until, upper
+
+Form = Mapping[str, arb]
+"""Σ coefficient · signal, by the signals' names; "1" is the constant 1."""
+_ROOM = 1e-9
+"""By so much, relatively, y exceeds the solution of y = Fy + g."""
+
+
+class Unit(NamedTuple):
+    """One of f₁ and f₂, with what is of this unit."""
+
+    rate: arb
+    has_start: bool
+    has_constants: bool
+    threshold: arb
+    noise: arb
+
+
+class Witness(NamedTuple):
+    """What a witness names: Lyapunov functions at the rate r, and T."""
+
+    plant: Decay  # of A + BK + r
+    model: Decay | None  # of H + r; None: the models hold the last update, or nothing is lost
+    inputs: arb_mat
+
+
+class Source(NamedTuple):
+    """A column through which something acts, and the sup of its amplitude in the equation of x and of e_s."""
+
+    column: arb_mat
+    lasting: Form  # in that of x
+    early: Form  # in that of x, up to the first input
+    of_error: Form
+    is_outside: bool = False  # acts before the first input, too, beside p
+
+
+def units_of(loop: Loop, rate: arb) -> list[Unit]:
+    """Return the units of a loop's bounds."""
+    (level, floor), (decaying, constant) = thresholds(loop, rate), noise_of(loop, rate).sizes
+    has_decaying, found = loop.has_decaying_unit(rate), []
+    if has_decaying:
+        found.append(Unit(rate, True, False, level, decaying))
+    if loop.needs_constant:
+        found.append(Unit(arb(0), not has_decaying, True, floor, constant))
+    return found
+
+
+def read_witness(loop: Loop, table: Mapping[str, object]) -> Witness:
+    """Return what a document's table "gains" names."""
+    decays = {}
+    for name in ("plant", "model"):
+        if name == "plant" or name in table:
+            entry = read_table(table, name)
+            decays[name] = Decay(read_matrix(entry, "form", loop.n), read_number(entry, "decay"))
+    T = read_rows(table, "inputs")
+    if (T.nrows(), T.ncols()) != (loop.B.ncols(),) * 2:
+        raise RejectedError("gains: inputs: not a square matrix of the right size")
+    return Witness(decays["plant"], decays.get("model"), T)
+
+
+def require_covered(loop: Loop) -> None:
+    """Raise RejectedError if the argument does not cover a loop: its rule, or unknown loads."""
+    n, rule = loop.n, loop.rule
+    if loop.loads or loop.push_before_input is not None or rule.memory is not None or rule.of_input:
+        raise RejectedError("gains: not with loads, nor a rule with a memory or of the input")
+    if loop.times.period > 0:
+        return
+    states, errors = range(n), range(n, 2 * n)
+    compares = rule.positive.nrows() == n and is_zero(columns_of(rule.positive, states))
+    compares = compares and is_zero(columns_of(rule.positive, errors) - loop.weight)
+    if not compares or (rule.negative.nrows() and not is_zero(columns_of(rule.negative, errors))):
+        raise RejectedError("gains: the rule does not compare ‖W e_s‖ with a threshold, or with x")
+
+
+class UnitGains:
+    """The inequalities in one unit, and their solution.
+
+    Args:
+        loop: the loop.
+        unit: the unit.
+        witness: what the document names.
+        wanted: the outputs to bound.
+
+    Raises:
+        RejectedError: a response is not enclosed, or a signal has no bound.
+    """
+
+    def __init__(self, loop: Loop, unit: Unit, witness: Witness, wanted: Container[str]) -> None:
+        self.loop, self.unit = loop, unit
+        n, m, times, rule, one = loop.n, loop.B.ncols(), loop.times, loop.rule, identity(loop.n)
+        try:
+            self._inputs, inverse = witness.inputs.inv(), loop.weight.inv()
+        except ZeroDivisionError:
+            raise RejectedError("gains: weight or inputs: not proven to have an inverse") from None
+        K, H, self._closed = witness.inputs * loop.gain, loop.H, loop.A + loop.B * loop.gain
+        self._early, is_periodic = arb(times.start), times.period > 0
+        self._untested = arb(times.period if is_periodic else max(times.sampling, times.dwell))
+        self._lost = 0 if is_periodic else loop.losses
+        recent = self._untested * (1 + loop.losses if is_periodic else 1) + arb(times.delay)
+        halves = zip(loop.half_A.tolist(), loop.half_B.tolist(), strict=True)
+        self._boxed = [i for i, rows in enumerate(halves) if any(entry != 0 for row in rows for entry in row)]
+        mismatch = self._closed - H
+        self._mismatched = [i for i in range(n) if not is_zero(rows_of(mismatch, [i]))]
+        self._sources = list(self._all_sources())
+
+        # The state.
+        aged = K * (-1 * upto(arb(times.age)) * H).exp()
+        share = columns_of(rule.negative, range(n)) if rule.negative.nrows() else zeros(0, n)
+        entries = {f"x[{i}]": rows_of(one, [i]) for i in range(n)}
+        entries |= {f"y[{i}]": rows_of(loop.output_rows, [i]) for i in range(loop.output_rows.nrows())}
+        outputs = {"x": one, "share": share}
+        outputs |= {
+            name: row for name, row in entries.items() if name in wanted or (self._boxed and name[0] == "x")
+        }
+        outputs |= {f"Kx {j}": rows_of(loop.gain, [j]) for j in range(m)}
+        outputs |= {f"Ex {i}": rows_of(mismatch, [i]) for i in self._mismatched}
+        if times.age > 0:
+            outputs |= {f"aged {j}": rows_of(aged, [j]) * H for j in range(m)}
+        columns = [source.column for source in self._sources] + [loop.start] * unit.has_start
+        found = responses(self._closed + unit.rate * one, witness.plant, list(outputs.values()), columns)
+        self._states = dict(zip(outputs, found, strict=True))
+        open_loop, rows = loop.A + unit.rate * one, [rows_of(K, [j]) for j in range(m)]
+        self._before = responses_until(open_loop, self._early, rows, columns)
+
+        # Errors.
+        self._scaled_H = H + unit.rate * one
+        errors = {"W": loop.weight} | {f"p {j}": rows_of(aged, [j]) for j in range(m)}
+        self._columns = [inverse, *(source.column for source in self._sources)]
+        found = responses_until(self._scaled_H, recent, list(errors.values()), self._columns)
+        self._recent = dict(zip(errors, found, strict=True))
+        self._untested_growth = self.growth(self._untested)
+        self._ever = {}
+        if self._lost:
+            self._ever = dict(zip(errors, self._for_ever(list(errors.values()), witness.model), strict=True))
+        self._tested = {"1": unit.noise + (arb(0) if is_periodic else unit.threshold)}
+        self._tested |= {"share": arb(1)} if share.nrows() else {}
+        self._share_of_noise = norm_of(share * inverse) * unit.noise
+        self.sups = self._solution()
+
+    def _all_sources(self) -> Iterator[Source]:
+        loop, unit, one = self.loop, self.unit, arb(1)
+        n, B = loop.n, loop.B * self._inputs
+        for j in range(B.ncols()):
+            yield Source(columns_of(B, [j]), {f"p {j}": one}, {f"p before {j}": one}, {f"p ever {j}": one})
+        for i in self._boxed:
+            amplitude = {f"box {i}": one}
+            yield Source(columns_of(identity(n), [i]), amplitude, {}, amplitude, is_outside=True)
+        for i in self._mismatched:
+            yield Source(columns_of(identity(n), [i]), {}, {}, {f"Ex {i}": one})
+        if unit.has_constants:
+            for i, size in enumerate(loop.sizes):
+                yield Source(columns_of(loop.pushes, [i]), {"1": size}, {}, {"1": size}, is_outside=True)
+
+    def growth(self, until: arb) -> list[Response]:
+        """Return the growth of W e_s within a time, from W⁻¹ and by each source."""
+        return responses_until(self._scaled_H, until, [self.loop.weight], self._columns)[0]
+
+    def _for_ever(self, outputs: Sequence[arb_mat], decay: Decay | None) -> list[list[Response]]:
+        if is_zero(self._scaled_H):
+            return [[Response(norm_of(C * Y), arb(0)) for Y in self._columns] for C in outputs]
+        if decay is None:
+            raise RejectedError("gains: model: missing")
+        return responses(self._scaled_H, decay, outputs, self._columns)
+
+    def state(self, name: str) -> Form:
+        """Return the bound of an output |Cx|."""
+        found = self._states[name]
+        terms: list[tuple[arb, Form]] = []
+        if self.unit.has_start:
+            terms.append((found[-1].most, {"1": arb(1)}))
+        for response, source in zip(found, self._sources, strict=False):
+            terms.append((response.total, source.lasting))
+            terms.append((response.total.min(self._early * response.most), source.early))
+        return _sum(*terms)
+
+    def input(self, j: int) -> Form:
+        """Return the bound of an input |u_j|; it is 0 before the first one."""
+        terms = [(abs(self._inputs[j, k]), {f"p {k}": arb(1)}) for k in range(self._inputs.ncols())]
+        return _sum((arb(1), self.state(f"Kx {j}")), *terms)
+
+    def sensor_error(self) -> Form:
+        """Return the bound of ‖W e_s‖."""
+        grown = self._untested_growth
+        return _sum((grown[0].most, self._tested), *self.driven(each.total for each in grown[1:]))
+
+    def error(self, name: str) -> Form:
+        """Return the bound of an output |C e_c|: "W", or "p j" for the row j of K e^{−Hs}."""
+        recent = self._recent[name]
+        terms = [(recent[0].most, self._tested), *self.driven(each.total for each in recent[1:])]
+        if self._lost:
+            gain, *ever = (each.most for each in self._ever[name])
+            terms += [(self._lost * gain, self._tested), (self._lost * gain, {"1": self.unit.noise})]
+            grown = [each.total for each in self._untested_growth[1:]]
+            pairs = zip(ever, grown, strict=True)
+            terms += self.driven(
+                self._lost * (self._untested * most).min(gain * total) for most, total in pairs
+            )
+        return _sum(*terms)
+
+    def driven(self, totals: Iterable[arb]) -> list[tuple[arb, Form]]:
+        """Return terms of an error, by what it is driven by each source."""
+        return [(total, source.of_error) for total, source in zip(totals, self._sources, strict=True)]
+
+    def _inequalities(self) -> Iterator[tuple[str, Form]]:
+        """Yield signals and what they are at most; of a signal with several, the largest."""
+        loop, one = self.loop, arb(1)
+        for j in range(loop.B.ncols()):
+            aged = [(arb(loop.times.age), self.state(f"aged {j}"))] if loop.times.age > 0 else []
+            yield f"p {j}", _sum((one, self.error(f"p {j}")), *aged)
+            before = self._before[j]
+            pairs = list(zip(before, self._sources, strict=False))
+            terms = [(response.total, source.of_error) for response, source in pairs if source.is_outside]
+            terms += [(before[-1].most, {"1": one})] if self.unit.has_start else []
+            yield f"p before {j}", _sum(*terms)
+            yield f"p ever {j}", {f"p {j}": one}
+            if self._early > 0:
+                yield f"p ever {j}", {f"p before {j}": one}
+        for i in self._boxed:
+            terms = [(loop.half_A[i, j], self.state(f"x[{j}]")) for j in range(loop.n)]
+            terms += [(loop.half_B[i, j], self.input(j)) for j in range(loop.B.ncols())]
+            yield f"box {i}", _sum(*terms)
+        for i in self._mismatched:
+            yield f"Ex {i}", self.state(f"Ex {i}")
+        yield "share", _sum((one, self.state("share")), (self._share_of_noise, {"1": one}))
+
+    def _solution(self) -> dict[str, arb]:
+        """Return y > Fy + g, by signals. Which inequality counts of several is tried."""
+        every = list(self._inequalities())
+        chosen = dict(reversed(every))
+        for _ in range(len(chosen)):
+            y = _solved(chosen)
+            failing = [(name, form) for name, form in every if not value(form, y) < y[name]]
+            if not failing:
+                return y
+            chosen |= dict(failing)
+        raise RejectedError(f"gains: {failing[0][0]} has no bound by them")
+
+
+def _sum(*terms: tuple[arb, Form]) -> Form:
+    """Return Σ factor · form."""
+    found: dict[str, arb] = {}
+    for factor, form in terms:
+        for name, size in form.items():
+            found[name] = found.get(name, arb(0)) + factor * size
+    return found
+
+
+def value(form: Form, sups: Mapping[str, arb]) -> arb:
+    """Return the value of a form, rounded up."""
+    return upper(sum((size * sups[name] for name, size in form.items()), arb(0)))
+
+
+def _solved(rows: Mapping[str, Form]) -> dict[str, arb]:
+    """Return y with y = Fy + g and some room, nearly.
+
+    Raises:
+        RejectedError: y is not above 0.
+    """
+    names, none = list(rows), arb(0)
+    F = arb_mat(len(names), len(names), [rows[a].get(b, none).mid() for a in names for b in names])
+    right = [rows[name].get("1", none) for name in names]
+    room = _ROOM * (sum(right, none) if any(each > 0 for each in right) else arb(1))
+    try:
+        y = (identity(len(names)) - F).solve(
+            arb_mat(len(names), 1, [((1 + _ROOM) * each + room).mid() for each in right])
+        )
+    except ZeroDivisionError:
+        raise RejectedError("gains: the inequalities have no solution") from None
+    found = {name: arb(y[i, 0].mid()) for i, name in enumerate(names)}
+    for name, size in found.items():
+        if not size > 0:
+            raise RejectedError(f"gains: {name} has no bound by them")
+    return found | {"1": arb(1)}
+
+
+class Gains:
+    """What is proven by gains.
+
+    Args:
+        loop: the loop.
+        rate: r.
+        table: the table "gains" of a document.
+
+    Raises:
+        RejectedError: it is not proven.
+    """
+
+    def __init__(self, loop: Loop, rate: arb, table: Mapping[str, object]) -> None:
+        require_covered(loop)
+        self.loop, self.rate, witness = loop, rate, read_witness(loop, table)
+        witness.plant.require(loop.A + loop.B * loop.gain + rate * identity(loop.n), "gains: plant")
+        if witness.model is not None:
+            witness.model.require(loop.H + rate * identity(loop.n), "gains: model")
+        counts = {"x": loop.n, "u": loop.B.ncols(), "y": loop.output_rows.nrows()}
+        entries = {f"{kind}[{i}]" for kind, count in counts.items() for i in range(count)}
+        outputs = table.get("outputs")
+        if not isinstance(outputs, list) or not {"x", "e_s", "e_c"} | entries >= {*map(str, outputs)}:
+            raise RejectedError("gains: outputs: not a list of the loop's")
+        self._units = [UnitGains(loop, unit, witness, outputs) for unit in units_of(loop, rate)]
+        self.bounds = {str(output): self._bound(str(output)) for output in outputs}
+        """D₁ and D₂ of each output that the document names."""
+
+    def _bound(self, output: str) -> tuple[arb, arb]:
+        found = {True: arb(0), False: arb(0)}
+        for gains in self._units:
+            index = int(output[2:-1]) if output.endswith("]") else 0
+            if output == "e_s":
+                form = gains.sensor_error()
+            elif output == "e_c":
+                form = gains.error("W")
+            else:
+                form = gains.input(index) if output.startswith("u[") else gains.state(output)
+            found[gains.unit.has_constants] = value(form, gains.sups)
+        return found[False], found[True]
+
+    def reached(self, time: arb) -> tuple[arb, arb]:
+        """Return bounds of ‖W (e_s − n)‖ in both units, n of a test up to a time after an event."""
+        found = {True: arb(0), False: arb(0)}
+        for gains in self._units:
+            grown = gains.growth(time)
+            form = _sum(*gains.driven(each.total for each in grown[1:]))
+            found[gains.unit.has_constants] = value(form, gains.sups) + (grown[0].most + 1) * gains.unit.noise
+        return found[False], found[True]

@@ -1,0 +1,113 @@
+"""The search for a witness by gains: Lyapunov functions at a rate, and coordinates of the inputs.
+
+Nothing here has to be right: :mod:`noack_check.gains` solves the inequalities and verifies the solution.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy.linalg import solve_continuous_lyapunov
+
+from noack.core.linear_systems import Matrix
+from noack.theory.witnesses.assumptions import observer_decay
+from noack.theory.witnesses.coordinates import floats
+from noack.theory.witnesses.effort import NoWitnessError
+from noack_check.balls import number
+from noack_check.check import RejectedError
+from noack_check.gains import Gains
+from noack_check.loop import Loop
+from noack_check.proof import compares_error
+
+_SHARES = (1.0, 0.5, 0.2, 0.0)
+"""Rates that are tried, in multiples of the largest one."""
+_FIRST_S, _NEARLY, _STEPS = 1e-6, 0.98, 12
+"""A time between events is accepted if e_s reaches nearly the threshold."""
+
+
+def find_gains(loop: Loop, rate: float, outputs: Sequence[str]) -> dict[str, object]:
+    """Return the table "gains" of a document with a rate.
+
+    Raises:
+        NoWitnessError: nothing is proven by gains at this rate.
+    """
+    table: dict[str, object] = {
+        "inputs": np.linalg.svd(floats(loop.gain))[0].T.tolist(),
+        "outputs": list(dict.fromkeys(outputs)),
+        "plant": _lyapunov(floats(loop.A + loop.B * loop.gain), rate, "A + BK"),
+    }
+    if loop.losses and not loop.times.period > 0 and (rate or not loop.holds):
+        table["model"] = _lyapunov(floats(loop.H), rate, "the model")
+    try:
+        gains = Gains(loop, number(rate), table)
+    except RejectedError as error:
+        raise NoWitnessError(str(error)) from None
+    if compares_error(loop) and not loop.rule.always:
+        table["inter_event_s"] = _inter_event_s(gains)
+    return table
+
+
+def find_by_gains(loop: Loop, outputs: Sequence[str]) -> dict[str, object]:
+    """Return a document without quadratic forms, with the largest rate that is found.
+
+    Raises:
+        NoWitnessError: nothing is proven by gains.
+    """
+    reason = "the loop does not decay without losses"
+    for rate in rates_by_gains(loop):
+        try:
+            return {"rate": rate, "gains": find_gains(loop, rate, outputs)}
+        except NoWitnessError as error:
+            reason = str(error)
+    raise NoWitnessError(reason)
+
+
+def rates_by_gains(loop: Loop) -> Iterator[float]:
+    """Yield rates of decay that bounds by gains may have, from the largest one."""
+    closed, H = floats(loop.A + loop.B * loop.gain), floats(loop.H)
+    falling = [closed] if loop.holds or not loop.losses else [closed, H]
+    slowest = min([observer_decay(loop), *(-float(np.linalg.eigvals(M).real.max()) for M in falling)])
+    level, threshold = float(loop.rule.level), float(loop.rule.rate)
+    if slowest <= 0:
+        return
+    largest = 0.3 * slowest
+    if level:
+        largest = threshold if threshold < 0.95 * slowest else 0.8 * slowest
+    if (loop.holds and loop.losses) or (level and not threshold):
+        largest = 0.0
+    yield from dict.fromkeys(share * largest for share in _SHARES)
+
+
+def _lyapunov(M: Matrix, rate: float, name: str) -> dict[str, object]:
+    """Return P and ν with (M + r)ᵀP + P(M + r) ⪯ −2νP."""
+    G = M + rate * np.eye(len(M))
+    decay = -0.5 * float(np.linalg.eigvals(G).real.max())
+    if decay <= 0:
+        raise NoWitnessError(f"{name} does not decay at {rate:.3g}/s")
+    P = solve_continuous_lyapunov((G + decay * np.eye(len(G))).T, -np.eye(len(G)))
+    P = (P + P.T) / 2
+    return {"form": (P / np.abs(P).max()).tolist(), "decay": decay * (1 - 1e-9)}
+
+
+def _inter_event_s(gains: Gains) -> float:
+    """Return a time before which e_s does not reach the threshold after an event; 0 if none is found."""
+    rule = gains.loop.rule
+    level, floor = float(rule.level), float(rule.floor)
+    if not bool(gains.rate == rule.rate):
+        level = 0.0
+    kinks = [0.0, 1.0] + ([floor / level] if level and floor < level else [])
+
+    def share(time: float) -> float:
+        """Return the largest share of the threshold that is reached."""
+        decaying, constant = (float(each) for each in gains.reached(number(time)))
+        pairs = [(decaying * v + constant, max(level * v, floor)) for v in kinks]
+        return max((reached / limit if limit else np.inf for reached, limit in pairs if reached), default=0.0)
+
+    short, at_once, time = 0.0, share(0.0), _FIRST_S
+    for _ in range(_STEPS if at_once < _NEARLY else 0):
+        reached = share(time)
+        if reached < 1:
+            short = max(short, time)
+        if _NEARLY < reached < 1:
+            break
+        time *= ((1 + _NEARLY) / 2 - at_once) / max(reached - at_once, 1e-9)
+    return short

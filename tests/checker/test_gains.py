@@ -1,0 +1,302 @@
+"""Bounds by gains: they are true in runs, near closed forms, and each condition of the argument counts."""
+
+import copy
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb, fmpq
+from scipy.linalg import expm
+
+from noack.theory.witnesses.documents import witness_by_gains
+from noack.theory.witnesses.effort import NoWitnessError
+from noack.theory.witnesses.gains import _lyapunov
+from noack_check.balls import beside, identity, matrix, number, zeros
+from noack_check.check import RejectedError
+from noack_check.loop import Loop, Times
+from noack_check.proof import Proof, prove
+from noack_check.responses import Decay, responses, responses_until
+from tests.checker.random_loops import (
+    random_loop,
+    random_loop_with_long_delays,
+    random_noisy_loop,
+    random_periodic_loop,
+)
+from tests.checker.runs import exceeded
+from tests.checker.test_false_witnesses import WRONG
+from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
+
+OUTPUTS = ("x", "e_s", "e_c", "x[0]", "y[0]", "u[0]")
+_ACCURACY, _OF_A_STIFF_ONE, _OF_QUADRATURE = 0.03, 0.5, 1e-4
+"""Of enclosed responses, of a fast state beside a slow one, and of a sum over a fine grid, relatively."""
+
+
+def by_gains(loop: Loop) -> tuple[dict[str, Any], Proof]:
+    witness = witness_by_gains(loop, OUTPUTS)
+    return dict(witness.document), witness.proof
+
+
+def sizes(proof: Proof, *, from_start: bool = True) -> dict[str, float]:
+    """Return the bounds at t = 0, or those in the limit."""
+    chosen = [bound for bound in proof.bounds if bound.from_start == from_start]
+    return {bound.output: float(bound.decaying) + float(bound.constant) for bound in chosen}
+
+
+def changed(loop: Loop, **times: fmpq) -> Loop:
+    return loop._replace(times=loop.times._replace(**times))
+
+
+# Responses.
+
+
+@pytest.mark.parametrize(
+    "M",
+    [
+        [[-1.0, 2.0], [-2.0, -1.0]],
+        [[-0.2, 10.0], [0.0, -0.2]],
+        [[-1e3, 300.0], [0.0, -0.5]],
+        [[0.0, 1.0, 0.0], [-4.0, -0.3, 1.0], [0.0, 0.0, -5.0]],
+    ],
+    ids=["a spiral", "a defective one", "a stiff one", "a slow one"],
+)
+def test_responses_are_those_of_quadrature(M: list[list[float]]) -> None:
+    n, floating = len(M), np.array(M)
+    table: Any = _lyapunov(floating, 0.0, "M")
+    decay = Decay(matrix(table["form"]), number(table["decay"]))
+    outputs, inputs = np.eye(n)[:1], np.ones((n, 1))
+    decay.require(matrix(M), "M")
+    found = responses(matrix(M), decay, [matrix(outputs.tolist()), identity(n)], [matrix(inputs.tolist())])
+    slowest = -np.linalg.eigvals(floating).real.max()
+    accuracy = _ACCURACY if np.linalg.norm(floating) < 1000 * slowest else _OF_A_STIFF_ONE
+    times = np.concatenate([[0.0], np.geomspace(1e-6, 30 / slowest, 6000)])
+    states = expm(floating * times[:, None, None]) @ inputs
+    for (response,), C in zip(found, (outputs, np.eye(n)), strict=True):
+        norms = np.linalg.norm(C @ states, axis=(1, 2))
+        assert norms.max() <= float(response.most) <= norms.max() * (1 + accuracy)
+        total = np.trapezoid(norms, times)
+        assert total * (1 - _OF_QUADRATURE) <= float(response.total) <= total * (1 + accuracy)
+
+
+def test_responses_up_to_a_time_may_grow() -> None:
+    [[found]] = responses_until(matrix([[1.0]]), number(2.0), [identity(1)], [identity(1)])
+    assert math.exp(2) <= float(found.most) <= math.exp(2) * 1.05
+    assert math.exp(2) - 1 <= float(found.total) <= (math.exp(2) - 1) * 1.05
+
+
+def scalar(losses: int = 2, times: Times = IDEAL, *, level: float = 0.1, floor: float = 0.0) -> Loop:
+    """Return ẋ = x + 2u, u = −x: the closed loop and the model decay at 1/s."""
+    loop, one = double_integrator(times), identity(1)
+    return loop._replace(
+        A=one, B=2 * one, half_A=zeros(1, 1), half_B=zeros(1, 1), model_A=one, model_B=2 * one,
+        gain=-1 * one, weight=one, start=one, losses=losses, pushes=zeros(1, 0), noise=zeros(1, 0),
+        rule=loop.rule._replace(
+            positive=beside(zeros(1, 1), one), negative=zeros(0, 2),
+            level=number(level), rate=number(0.25), floor=number(floor),
+        ),
+    )  # fmt: skip
+
+
+def test_a_scalar_loop_has_the_bounds_of_the_closed_form() -> None:
+    """With G = −1 + r all suprema are at once: ‖e_c‖ ≤ Mθ, and ∫2e^{−(1−r)s} ds = 2/(1 − r)."""
+    document, proof = by_gains(scalar())
+    assert document["rate"] == 0.25
+    found = sizes(proof)
+    assert found["e_s"] == pytest.approx(0.1, rel=1e-6)
+    assert found["e_c"] == pytest.approx(0.3, rel=_ACCURACY)
+    assert found["x"] == pytest.approx(1 + 0.3 * 2 / 0.75, rel=_ACCURACY)
+    assert found["u[0]"] == pytest.approx(found["x"] + found["e_c"], rel=1e-6)
+
+
+def test_a_constant_disturbance_has_the_limit_of_the_closed_form() -> None:
+    """In the limit e_c is at most M times the floor, and |x| at most the integrals of both."""
+    loop = scalar(floor=0.01)._replace(pushes=identity(1), sizes=(number(0.05),))
+    limits = sizes(by_gains(loop)[1], from_start=False)
+    assert limits["x"] == pytest.approx(0.05 + 2 * 0.03, rel=_ACCURACY)
+
+
+def test_any_number_of_later_events_is_covered() -> None:
+    """A delay of 40 tests: the quadratic forms would need as many vectors."""
+    loop = scalar(
+        0, SCHEDULE._replace(sampling=fmpq(1, 1000), least_sampling=fmpq(1, 1000), delay=fmpq(1, 25))
+    )
+    assert sizes(by_gains(loop)[1])["e_c"] < 0.2
+
+
+# What is proven is true, and what is not is rejected.
+
+
+REJECTED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "a rate that is too large": (lambda document: document.update(rate=0.24999), "inter_event_s"),
+    "a rate above that of the threshold": (lambda document: document.update(rate=0.26), "^rate"),
+    "a time between events that is too long": (
+        lambda document: document["gains"].update(inter_event_s=1.05 * document["gains"]["inter_event_s"]),
+        "inter_event_s",
+    ),
+    "a negative time between events": (
+        lambda document: document["gains"].update(inter_event_s=-1.0), "inter_event_s",
+    ),
+    "no tail of the model": (lambda document: document["gains"].pop("model"), "model: missing"),
+    "no tail of the plant": (lambda document: document["gains"].pop("plant"), "plant"),
+    "a tail that falls too fast": (
+        lambda document: document["gains"]["plant"].update(decay=2.0), "plant: not proven to decay",
+    ),
+    "a tail that grows": (
+        lambda document: document["gains"]["model"].update(decay=-1.0), "model: not proven to decay",
+    ),
+    "a form that is not positive": (
+        lambda document: document["gains"]["plant"].update(form=[[-1.0]]), "plant: not proven to decay",
+    ),
+    "inputs without coordinates": (lambda document: document["gains"].update(inputs=[[0.0]]), "inverse"),
+    "inputs of another size": (lambda document: document["gains"].update(inputs=[[1.0, 0.0]]), "inputs"),
+    "an unknown output": (lambda document: document["gains"].update(outputs=["x[7]"]), "outputs"),
+    "no table": (lambda document: document.update(gains=3), "gains"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", REJECTED)
+def test_changed_documents_are_rejected(change: str) -> None:
+    loop = scalar(times=SCHEDULE)
+    document = copy.deepcopy(by_gains(loop)[0])
+    apply, reason = REJECTED[change]
+    apply(document)
+    with pytest.raises(RejectedError, match=reason) as caught:
+        prove(loop, document)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("change", WRONG)
+def test_a_loop_that_is_none_is_rejected(change: str) -> None:
+    loop = double_integrator()
+    with pytest.raises(RejectedError):
+        prove(WRONG[change](loop), by_gains(loop)[0])
+
+
+def test_another_gain_is_rejected() -> None:
+    loop = scalar(times=SCHEDULE)
+    with pytest.raises(RejectedError):
+        prove(loop._replace(gain=number(-0.6) * identity(1)), by_gains(loop)[0])
+
+
+def test_a_loop_gain_above_1_is_rejected() -> None:
+    """Inputs that are 1 s old, with a plant that grows by e in this time."""
+    loop = scalar(times=SCHEDULE)
+    with pytest.raises(RejectedError, match="has no bound by them"):
+        prove(changed(loop, age=fmpq(1)), by_gains(loop)[0])
+
+
+def test_what_is_not_covered_is_rejected() -> None:
+    loop = double_integrator()
+    document = by_gains(loop)[0]
+    mixed = loop.rule._replace(positive=matrix([[1, 0, 1, 0], [0, 0, 0, 1]]))
+    for other in (loop._replace(rule=mixed), loop._replace(push_before_input=loop.start)):
+        with pytest.raises(RejectedError, match=r"^gains: "):
+            prove(other, document)
+
+
+LIES: dict[str, tuple[Loop, Callable[[Loop], Loop]]] = {
+    "a loss": (scalar(times=SCHEDULE, floor=0.02), lambda loop: loop._replace(losses=0)),
+    "noise": (
+        scalar(times=SCHEDULE, floor=0.02)._replace(noise=number(0.015) * identity(1)),
+        lambda loop: loop._replace(noise=zeros(1, 0)),
+    ),
+    "a disturbance": (
+        scalar(0, SCHEDULE, floor=0.02)._replace(pushes=identity(1), sizes=(number(3.0),)),
+        lambda loop: loop._replace(pushes=zeros(1, 0), sizes=()),
+    ),
+    "the start": (
+        scalar(times=SCHEDULE)._replace(start=10 * identity(1)),
+        lambda loop: loop._replace(start=identity(1)),
+    ),
+    "the time without an input": (
+        changed(scalar(times=SCHEDULE), start=fmpq(2)), lambda loop: changed(loop, start=fmpq(0)),
+    ),
+    "the threshold": (
+        scalar(times=SCHEDULE), lambda loop: loop._replace(rule=loop.rule._replace(level=number(0.05))),
+    ),
+    "a share of x": (
+        scalar(0, SCHEDULE)._replace(
+            rule=scalar().rule._replace(negative=number(0.2) * matrix([[1, 0]]))
+        ),
+        lambda loop: loop._replace(rule=loop.rule._replace(negative=zeros(0, 2))),
+    ),
+    "slow tests": (
+        changed(scalar(0, SCHEDULE), sampling=fmpq(1, 5), least_sampling=fmpq(1, 5)),
+        lambda loop: changed(loop, sampling=fmpq(1, 100), least_sampling=fmpq(1, 100)),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("left_out", LIES)
+def test_a_proof_that_leaves_out_a_condition_is_exceeded_by_runs(left_out: str) -> None:
+    loop, lie = LIES[left_out]
+    true, false = by_gains(loop)[1], by_gains(lie(loop))[1]
+    until, seeds = 6.0, range(8)
+    assert any(exceeded(loop, false, np.random.default_rng(seed), until) for seed in seeds)
+    assert not any(exceeded(loop, true, np.random.default_rng(seed), until) for seed in seeds)
+
+
+DRAWS = (random_loop, random_periodic_loop, random_noisy_loop, random_loop_with_long_delays)
+
+
+@pytest.mark.parametrize("draw", DRAWS)
+def test_bounds_of_random_loops_are_not_exceeded(draw: Callable[[np.random.Generator], Loop]) -> None:
+    found = 0
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        loop = draw(rng)
+        try:
+            proof = by_gains(loop)[1]
+        except NoWitnessError:
+            continue
+        found += 1
+        step = loop.times.sampling if loop.times.sampling > 0 else loop.times.period / 5
+        assert exceeded(loop, proof, rng, 200 * float(arb(step))) == []
+    assert found
+
+
+def least_sizes(loop: Loop) -> dict[str, float]:
+    return sizes(by_gains(loop)[1])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda loop: loop._replace(losses=3),
+        lambda loop: changed(loop, delay=fmpq(1, 10)),
+        lambda loop: changed(loop, age=fmpq(1, 10)),
+        lambda loop: changed(loop, start=fmpq(1, 10)),
+        lambda loop: changed(loop, sampling=fmpq(1, 10), least_sampling=fmpq(1, 10)),
+        lambda loop: loop._replace(start=2 * loop.start),
+        lambda loop: loop._replace(noise=number(0.005) * identity(1)),
+        lambda loop: loop._replace(pushes=identity(1), sizes=(number(0.1),)),
+        lambda loop: loop._replace(half_A=number(0.05) * identity(1)),
+        lambda loop: loop._replace(half_B=number(0.05) * identity(1)),
+        lambda loop: loop._replace(model_A=number(0.9) * identity(1)),
+        lambda loop: loop._replace(rule=loop.rule._replace(level=number(0.12))),
+        lambda loop: loop._replace(rule=loop.rule._replace(floor=number(0.03))),
+        lambda loop: loop._replace(rule=loop.rule._replace(negative=number(0.01) * matrix([[1, 0]]))),
+    ],
+    ids=[
+        "losses",
+        "delay",
+        "age",
+        "start-time",
+        "sampling",
+        "start",
+        "noise",
+        "disturbance",
+        "A",
+        "B",
+        "model",
+        "level",
+        "floor",
+        "share",
+    ],
+)
+def test_each_condition_counts(change: Callable[[Loop], Loop]) -> None:
+    loop = scalar(times=SCHEDULE, floor=0.02)
+    before, after = least_sizes(loop), least_sizes(change(loop))
+    assert after["x"] > before["x"] * 1.001
+    assert min(after[name] / before[name] for name in before) > 1 - 1e-6
