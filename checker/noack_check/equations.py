@@ -34,8 +34,8 @@ SIGNALS = ("sign", "tanh", "arctan", "clip")
 _SLICES = 32
 _LONGEST_S = 1e9
 """The time in equations is from 0 to this."""
-_NARROW = 1e-12
-"""An entry that varies by less, relatively, stays a ball; others have half-widths."""
+_NARROW = 1e-25
+"""An entry that varies by less, relatively, stays a ball, which rounding left; others have half-widths."""
 _MOST_POWER = 100
 
 

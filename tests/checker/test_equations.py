@@ -102,6 +102,15 @@ def test_a_small_signal_is_no_missing_one() -> None:
     assert all(least == 0 for _, least in plants.along)
 
 
+def test_a_slope_that_varies_little_is_no_constant() -> None:
+    """Exponentials of A are about a constant A: 1 − cos x is 5e-15 at most, and rounding is 1e-38."""
+    steps = [["state", 0], ["cos", 0], ["times", 0, 1], ["number", 0.1], ["times", 0, 3], ["add", 2, 4]]
+    plants = enclose({"steps": steps, "rates": [5]}, Region((arb(1e-7),), (arb(1),)))
+    assert 1e-15 < float(plants.half_A[0, 0]) < 1e-13
+    exact = enclose({"steps": steps, "rates": [4]}, Region((arb(1e-7),), (arb(1),)))
+    assert exact.half_A[0, 0] == 0
+
+
 def test_a_signal_of_which_the_size_is_around_0_is_kept() -> None:
     steps = [["state", 0], ["state", 1], ["number", 1e9], ["times", 1, 2], ["sign", 0], ["cos", 1],
              ["number", -1.0], ["add", 5, 6], ["times", 4, 7], ["add", 3, 8]]  # fmt: skip
