@@ -354,11 +354,13 @@ def _outputs(resolved: Table, n: int) -> arb_mat:
 
 
 def output_names(resolved: Table) -> list[str]:
-    """Return the names of a resolved scenario's outputs, which by default are the states."""
-    entries = _tables(resolved, "outputs")
-    names = [entry.get("name") for entry in entries] or _table(resolved, "model").get("state_names", [])
+    """Return the names of a resolved scenario's outputs, which by default are the states; [] without names."""
+    entries, model = _tables(resolved, "outputs"), _table(resolved, "model")
+    names = [entry.get("name") for entry in entries] or model.get("state_names", [])
     if not isinstance(names, list) or not all(isinstance(name, str) and name.isprintable() for name in names):
         raise RefusedError("outputs.name: not a printable name")
+    if names and not entries and len(names) != (n := len(_matrix(model, "model.A"))):
+        raise RefusedError(f"model.state_names: not {n} names")
     return names
 
 

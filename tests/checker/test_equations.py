@@ -19,6 +19,7 @@ from noack.theory.witnesses.coordinates import floats
 from noack_check.__main__ import check_file
 from noack_check.check import RejectedError
 from noack_check.equations import LinearPlants, enclose
+from noack_check.keys import RefusedError
 from noack_check.loop import Region
 from tests.oracles.attacked_regions import CASES, SCENARIOS, attacked, certificate_of
 
@@ -205,6 +206,14 @@ def test_false_witnesses_of_a_region_are_rejected(
     changed = copy.deepcopy(witness)
     change(changed["statements"][0], place, value)
     with pytest.raises(ValueError, match=reason):
+        list(check_file(changed, None))
+
+
+@pytest.mark.parametrize("names", [["angle"], ["angle", "rate", "time"]])
+def test_each_state_has_a_name_or_none_has(witness: dict[str, Any], names: list[str]) -> None:
+    changed = copy.deepcopy(witness)
+    changed["scenario"]["model"]["state_names"] = names
+    with pytest.raises(RefusedError, match="not 2 names"):
         list(check_file(changed, None))
 
 
