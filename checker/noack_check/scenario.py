@@ -354,7 +354,7 @@ def _outputs(resolved: Table, n: int) -> arb_mat:
 
 
 def output_names(resolved: Table) -> list[str]:
-    """Return the names of a resolved scenario's outputs, which by default are the states; [] without names."""
+    """Return the names of a resolved scenario's outputs, by default of the states; empty: there are none."""
     entries, model = _tables(resolved, "outputs"), _table(resolved, "model")
     names = [entry.get("name") for entry in entries] or model.get("state_names", [])
     if not isinstance(names, list) or not all(isinstance(name, str) and name.isprintable() for name in names):
