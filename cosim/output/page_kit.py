@@ -1,14 +1,14 @@
-"""The kit of all HTML pages: templates in ``pages/``, with filters for values and figures.
+"""The writer of all HTML pages: a document becomes a page by the templates in ``pages/``.
 
-A page extends ``page.html.jinja`` and uses the macros for verdicts, tables and figures. All text is
-escaped; figures are drawn where they are used.
+:func:`document_page` writes every page, of the one template ``document.html.jinja``. All text is escaped;
+figures are drawn where they are used.
 """
 
 import tomllib
 from functools import cache
 from pathlib import Path
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from cosim.output.document import Document, Sentence, SentenceRole
@@ -16,9 +16,7 @@ from cosim.output.figures.figure_files import inline, save_figures
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.figures.page_figure import PageFigure
 from cosim.output.result_tables import Tone
-from cosim.output.run_tables import interval_text
 from cosim.record.run_directory import write_output
-from noack.core.number_format import number
 
 PAGES = Path(__file__).with_name("pages")
 TERMS: tuple[tuple[str, str], ...] = tuple(
@@ -27,28 +25,20 @@ TERMS: tuple[tuple[str, str], ...] = tuple(
 )
 """The project's words and their meanings, in an order in which each uses earlier ones only."""
 _NONE = "–"
-_TONES = {"held": "good", "holds": "good", "violated": "bad", "void": "doubt"}
 
 
 @cache
-def templates(folder: Path = PAGES) -> Environment:
-    """Return the templates of a folder and of the kit."""
+def _template() -> Template:
+    """Return the template of all pages."""
     environment = Environment(
-        loader=FileSystemLoader([folder, PAGES]),
+        loader=FileSystemLoader(PAGES),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters: dict[str, object] = {
-        "tone": lambda word: _TONES.get(word, ""),
-        "inline": _markup,
-        "interval": interval_text,
-        "number": number,
-        "shown": value_text,
-    }
-    environment.filters |= filters
-    return environment
+    environment.filters["inline"] = _markup
+    return environment.get_template("document.html.jinja")
 
 
 def document_page(document: Document) -> str:
@@ -60,7 +50,7 @@ def document_page(document: Document) -> str:
         for block in document.blocks
         if not (isinstance(block, Sentence) and (block.role != SentenceRole.TEXT or not block.on_page))
     ]
-    return templates().get_template("document.html.jinja").render(document=document, tone=tone, blocks=blocks)
+    return _template().render(document=document, tone=tone, blocks=blocks)
 
 
 def save_page(document: Document, path: Path, files: FigureFiles | None = None) -> list[Path]:

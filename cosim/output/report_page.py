@@ -1,13 +1,13 @@
-"""The report of a run: its summary and its figures, as one HTML page.
+"""The report of a run: its summary and its figures, as a document with a page.
 
-A report has sections. Each is a function here that returns what the section shows, or None if there
-is nothing to show, and a template of the same name in ``pages/report/``. The page of a run shows
-the network, the loops and the worst loop in detail; where one loop has the network for itself, that
-is the page of the loop.
+A report has sections. Each is a function here that yields the blocks that the section shows. The page
+of a run shows the network, the loops and the worst loop in detail; where one loop has the network for
+itself, that is the page of the loop.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from urllib.parse import quote
 
@@ -16,15 +16,18 @@ import numpy as np
 from cosim.analysis.summary.loops_over_time import LoopOverTime
 from cosim.analysis.summary.run_summary import worst_loop
 from cosim.analysis.summary.summary_model import LoopSummary, RunSummary
+from cosim.output.document import Block, Document, Folded, Heading, Sentence
 from cosim.output.figures.network_figures import network_figures
 from cosim.output.figures.page_figure import PageFigure
 from cosim.output.figures.run_figures import envelopes, run_figures
-from cosim.output.page_kit import TERMS, templates, value_text, words
-from cosim.output.result_tables import Tone
+from cosim.output.page_kit import TERMS, document_page, value_text, words
+from cosim.output.result_tables import KEY_VALUE, ResultTable
+from cosim.output.run_document import assumption_table
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
     badness,
     caps_text,
+    claims_in_full,
     key_numbers,
     loops_table,
     mode_words,
@@ -50,11 +53,6 @@ from noack.scenario.scenario import Scenario
 
 PROCESS_FIGURES = ("lateness", "latency", "clocks")
 """These have a section of their own, after the signals."""
-
-Content = Mapping[str, object]
-"""What a template shows."""
-SECTIONS: "dict[str, Callable[[Report], Content | None]]" = {}
-"""The sections in their order, by the names of their templates."""
 
 
 @dataclass(frozen=True)
@@ -151,113 +149,136 @@ def write_report(
             if (run_dir / (file := file_of_loop(REPORT_FILE, each.name))).is_file()
         },
     )
-    return write_whole(run_dir / file_of_loop(REPORT_FILE, loop), page(report))
+    return write_whole(run_dir / file_of_loop(REPORT_FILE, loop), document_page(report_document(report)))
 
 
-def page(report: Report) -> str:
-    """Return a report as HTML; everything but figures is escaped."""
-    contents = [(name, content(report)) for name, content in SECTIONS.items()]
-    sections = [(name, content) for name, content in contents if content is not None]
-    return templates().get_template("report.html.jinja").render(report=report, sections=sections)
+def report_document(report: Report) -> Document:
+    """Return what a report shows, from the verdict to the meaning of its words."""
+    shares = report.shares_network
+    sections = [
+        *([_network, _loops, _worst_loop] if shares else [_remarks]),
+        _signals, _numbers, _claims, _assumptions, _timing, _replay, _scenario, _words,
+    ]  # fmt: skip
+    return Document(
+        title=report.summary.scenario,
+        kind="report",
+        subtitle=report.subtitle,
+        description=report.description,
+        blocks=[*verdict(report.summary), *chain.from_iterable(section(report) for section in sections)],
+    )
 
 
-def section(content: "Callable[[Report], Content | None]") -> None:
-    """Register a section; its template has the name of the function, without ``_``."""
-    SECTIONS[content.__name__.removeprefix("_")] = content
+def _remarks(report: Report) -> Iterator[Block]:
+    yield from remarks(report.detail)
 
 
-@section
-def _verdict(report: Report) -> Content:
-    lines = verdict(report.summary)
-    notes = [remark.text for remark in remarks(report.detail)]
-    tones = {line.tone for line in lines} - {Tone.NEUTRAL}
-    is_good = tones == {Tone.GOOD} and (report.shares_network or not notes)
-    tone = Tone.GOOD if is_good else Tone.DOUBTFUL
-    return {
-        "lines": [line.text for line in lines],
-        "tone": Tone.BAD if Tone.BAD in tones else tone,
-        "remarks": [] if report.shares_network else notes,
-    }
+def _network(report: Report) -> Iterator[Block]:
+    first, *others = report.network_figures
+    yield Heading("Network")
+    yield _pairs("All loops together", network_rows(report.summary))
+    yield first
+    yield Heading("Errors and states of all loops")
+    yield from others
 
 
-@section
-def _network(report: Report) -> Content | None:
-    if not report.shares_network:
-        return None
-    return {"rows": network_rows(report.summary), "figures": report.network_figures}
-
-
-@section
-def _loops(report: Report) -> Content | None:
-    if not report.shares_network:
-        return None
+def _loops(report: Report) -> Iterator[Block]:
     loops = sorted(report.summary.loops, key=badness, reverse=True)
-    return {
-        "caption": LOOPS_CAPTION,
-        "table": loops_table(loops, ""),
-        "links": report.links,
-    }
+    order = "Failed loops come first; the others by violated and void claims, burst and ‖e_c‖"
+    yield Heading("Loops")
+    yield Sentence(
+        text="A name with a link has a report of its own. That of another loop is written by “noack report "
+        "RUN --loop NAME”, and then linked here by “noack report RUN --again”; RUN is this folder."
+    )
+    yield loops_table(loops, f"{LOOPS_CAPTION}. {order}")._replace(links=report.links)
 
 
-@section
-def _worst_loop(report: Report) -> Content | None:
-    if not report.shares_network:
-        return None
-    loop, why = report.loop, report.why
-    return {
-        "name": loop.name,
-        "why": f"{why[:1].upper()}{why[1:]}. Its time starts {seconds(loop.phase_s)} after that of the run.",
-        "remarks": [remark.text for remark in remarks(report.detail)],
-    }
+def _worst_loop(report: Report) -> Iterator[Block]:
+    starts = f"Its time starts {seconds(report.loop.phase_s)} after that of the run"
+    why = f"{report.why[:1].upper()}{report.why[1:]}"
+    yield Heading(f"The worst loop: {report.loop.name}")
+    yield Sentence(text=f"{why}. {starts}. The following sections are about it.")
+    for remark in remarks(report.detail):
+        yield Sentence(text=remark.text, lead=remark.lead)
 
 
-@section
-def _signals(report: Report) -> Content:
-    return {"figures": [figure for figure in report.figures if figure.name not in PROCESS_FIGURES]}
+def _signals(report: Report) -> Iterator[Block]:
+    yield Heading("Signals")
+    yield from (figure for figure in report.figures if figure.name not in PROCESS_FIGURES)
 
 
-@section
-def _numbers(report: Report) -> Content:
+def _numbers(report: Report) -> Iterator[Block]:
     loop = report.loop.model_copy(update={"replay": None})  # has its own section
-    detail = report.detail.model_copy(update={"loops": [loop]})
-    return {"numbers": key_numbers(detail), "parameters": [*_parameters(report.scenario)]}
+    yield Heading("Key numbers")
+    yield _pairs("Results", key_numbers(report.detail.model_copy(update={"loops": [loop]})))
+    yield _pairs("Scenario", [*_parameters(report.scenario)])
 
 
-@section
-def _claims(report: Report) -> Content | None:
-    loop = report.loop
-    return {"claims": loop.claims, "tables": [*schedule_tables(loop)]} if loop.claims else None
+def _claims(report: Report) -> Iterator[Block]:
+    if not report.loop.claims:
+        return
+    yield Heading("Claims")
+    yield Sentence(
+        text="The claims about this run, and what was observed. Share used is the largest share of the bound "
+        "that the run reached; a bound that is computed from the run itself is reached by construction. "
+        "Void: the run violated a condition of the claim, which was checked until then. Not applicable: the "
+        "run exceeded the bound, but does not meet its assumption, and so does not refute it."
+    )
+    yield claims_in_full(report.loop.claims)
+    yield from map(_capitalized, schedule_tables(report.loop))
 
 
-@section
-def _assumptions(report: Report) -> Content | None:
-    return {"assumptions": report.loop.assumptions} if report.loop.assumptions else None
+def _assumptions(report: Report) -> Iterator[Block]:
+    if report.loop.assumptions:
+        yield Heading("The paper's assumptions")
+        yield assumption_table(report.loop.assumptions)
 
 
-@section
-def _timing(report: Report) -> Content | None:
-    figures = [figure for figure in report.figures if figure.name in PROCESS_FIGURES]
+def _timing(report: Report) -> Iterator[Block]:
     table = timing_table(report.loop)
-    return {"table": table, "figures": figures} if table.rows or figures else None
+    figures = [figure for figure in report.figures if figure.name in PROCESS_FIGURES]
+    if table.rows or figures:
+        yield Heading("Timing")
+        yield from [_capitalized(table)] if table.rows else []
+        yield from figures
 
 
-@section
-def _replay(report: Report) -> Content | None:
-    return {"replay": report.loop.replay} if report.loop.replay else None
+def _replay(report: Report) -> Iterator[Block]:
+    if (replay := report.loop.replay) is None:
+        return
+    yield Heading("Replay")
+    if replay.bit_exact is None:
+        text = f"Nothing could be replayed: {replay.error or 'the record is empty'}."
+    elif replay.bit_exact:
+        text = (
+            f"The {replay.inputs:,} recorded inputs were replayed: the outputs equal the record, bit for bit."
+        )
+    else:
+        difference = replay.first_difference
+        text = f"The recorded inputs were replayed: an output differs from the record: {difference}."
+    yield Sentence(text=text)
+    if not replay.complete:
+        yield Sentence(text="The record has gaps, which could not be compared.")
 
 
-@section
-def _scenario(report: Report) -> Content:
-    return {
-        "kind": "" if report.shares_network else "resolved ",
-        "toml": report.scenario_toml,
-        "environment": environment_rows(report.environment),
-    }
+def _scenario(report: Report) -> Iterator[Block]:
+    kind = "" if report.shares_network else "resolved "
+    yield Heading("Scenario and environment")
+    yield Folded(f"The {kind}scenario (TOML)", report.scenario_toml)
+    if report.environment:
+        yield _pairs("Environment", environment_rows(report.environment))
 
 
-@section
-def _words(report: Report) -> Content:
-    return {"terms": TERMS}
+def _words(report: Report) -> Iterator[Block]:
+    yield Heading("What the words mean")
+    yield ResultTable("", "", ("word", "meaning"), TERMS, left=range(2))
+
+
+def _pairs(caption: str, rows: Sequence[tuple[str, str]]) -> ResultTable:
+    return ResultTable("", caption, KEY_VALUE, rows, left=range(2))
+
+
+def _capitalized(table: ResultTable) -> ResultTable:
+    return table._replace(caption=f"{table.caption[:1].upper()}{table.caption[1:]}")
 
 
 def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:

@@ -54,6 +54,19 @@ class ResultTable(NamedTuple):
     """Rows that a terminal shows; None: all."""
     more: str = ""
     """Line below the table on a terminal."""
+    links: Mapping[str, str] = MappingProxyType({})
+    """Addresses to which the names of rows lead on a page."""
+
+    @property
+    def left_columns(self) -> Collection[int]:
+        """The columns that begin at the left."""
+        return range(self.names) if self.left is None else self.left
+
+    def tone_of(self, column: int, text: str) -> Tone:
+        """Return the tone of a text in a column."""
+        if column != (len(self.headings) - 1 if self.headings else 0):
+            return Tone.NEUTRAL
+        return next((tone for word, tone in self.tones.items() if text.startswith(word)), Tone.NEUTRAL)
 
     @property
     def rows_on_terminal(self) -> list[Sequence[str]]:

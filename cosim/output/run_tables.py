@@ -309,6 +309,24 @@ def _claims_table(claims: Claims, title: str) -> ResultTable:
     return ResultTable("claims", title, headings, rows, left=left, tones=_CLAIM_TONES)
 
 
+def claims_in_full(claims: Claims) -> ResultTable:
+    """Return the table of claims with their bounds in words and numbers, for a page."""
+    rows = []
+    for claim in claims:
+        since = "" if claim.since_s is None else f" since {claim.since_s:.3f} s"
+        what = ", ".join(filter(None, (claim.what, interval_text(claim))))
+        share = NONE if claim.ratio is None else f"{number(100 * claim.ratio)} %"
+        numbers = (
+            claim.certified_text or NONE,
+            NONE if claim.observed is None else number(claim.observed),
+            share,
+        )
+        rows.append((what, claim.origin, claim.bound, *numbers, claim.why, claim.verdict + since))
+    headings = ("claim", "source", "bound", "certified", "observed", "share used", "why", "verdict")
+    caption = "Bounds, compared with the run"
+    return ResultTable("", caption, headings, rows, left=(0, 1, 2, 6, 7), tones=_CLAIM_TONES)
+
+
 def _replay(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:
     if verdict is None:
         return

@@ -52,7 +52,7 @@ def terminal_table(table: ResultTable) -> Table:
         collapse_padding=dense,
         pad_edge=not dense,
     )
-    left = range(table.names) if table.left is None else table.left
+    left = table.left_columns
     for i, heading in enumerate(table.headings):
         words = " ".join([heading, *(row[i] for row in table.rows)]).split()
         rich_table.add_column(
@@ -62,7 +62,7 @@ def terminal_table(table: ResultTable) -> Table:
             no_wrap=dense and i not in left,
         )
     for *cells, last in table.rows_on_terminal:
-        rich_table.add_row(*map(escape, cells), _toned(last, table))
+        rich_table.add_row(*map(escape, cells), Text(last, _STYLES[table.tone_of(len(cells), last)]))
     return rich_table
 
 
@@ -70,13 +70,8 @@ def _listing(table: ResultTable) -> Table:
     """Return a table without headings; the tones are those of its first column."""
     rich_table = Table.grid(padding=(0, 2))
     for first, *cells in table.rows:
-        rich_table.add_row(_toned(first, table), *map(escape, cells))
+        rich_table.add_row(Text(first, _STYLES[table.tone_of(0, first)]), *map(escape, cells))
     return rich_table
-
-
-def _toned(text: str, table: ResultTable) -> Text:
-    tone = next((tone for word, tone in table.tones.items() if text.startswith(word)), Tone.NEUTRAL)
-    return Text(text, _STYLES[tone])
 
 
 def _fitting(table: ResultTable, width: int) -> Iterator[Table]:

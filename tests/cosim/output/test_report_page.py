@@ -10,7 +10,8 @@ import pytest
 from cosim.analysis.summary.summary_model import RunSummary
 from cosim.output import report_page
 from cosim.output.figures.run_figures import run_figures
-from cosim.output.report_page import Report, page, write_report
+from cosim.output.page_kit import document_page
+from cosim.output.report_page import Report, report_document, write_report
 from cosim.record.run_directory import REPORT_FILE
 from cosim.record.run_record import RunRecord
 from noack.scenario.scenario_file import dumps as scenario_toml
@@ -47,7 +48,7 @@ def written(record: RunRecord, run_dir: Path, **more: Any) -> tuple[Page, RunSum
 
 def shown(record: RunRecord, **more: Any) -> str:
     """The text of a report without figures, which take most of the time."""
-    html = page(Report(summary_of(record, **more), record.scenario, 0))
+    html = document_page(report_document(Report(summary_of(record, **more), record.scenario, 0)))
     parsed = Page(html)
     check(parsed, html)
     return parsed.text
@@ -96,7 +97,7 @@ def test_the_report_of_a_live_run_is_complete(record: RunRecord, tmp_path: Path)
     for claim in CLAIMS:
         for key in ("what", "source", "bound", "verdict", "why"):
             assert str(claim[key]) in page.text
-    for number in ("2.5", "0.4371", "17.5 %", "t = 3.25 s", "0.011"):
+    for number in ("2.5", "0.4371", "17.5 %", "void since 3.250 s", "0.011"):
         assert number in page.text
     for assumption in summary.loops[0].assumptions:
         assert assumption.what in page.text

@@ -15,7 +15,8 @@ from rich.console import Console
 import noack
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
-from cosim.output.report_page import Report, page
+from cosim.output.page_kit import document_page
+from cosim.output.report_page import Report, report_document
 from cosim.output.run_document import run_document
 from cosim.output.run_tables import key_numbers
 from cosim.output.terminal_writer import print_document
@@ -115,7 +116,7 @@ def show(record: RunRecord, summary: RunSummary) -> None:
     """Every function that reads a summary."""
     outcome = Outcome(Path("run"), ExitStatus.OK, "horizon", summary)
     print_document(Console(file=io.StringIO()), run_document(outcome))
-    page(Report(summary, record.scenario, 0))
+    document_page(report_document(Report(summary, record.scenario, 0)))
     run = noack.Run(outcome.run_dir, lambda: outcome)
     assert repr(run)
     assert run._repr_html_()
