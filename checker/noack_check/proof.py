@@ -123,11 +123,14 @@ def conclude(
         bounds.append(Bound("e_c", decaying, constant, True))
     if gains is not None:
         bounds += [Bound(output, *sizes, True) for output, sizes in gains.bounds.items()]
-        if loop.needs_constant and rate > 0:  # then what the start adds is in f₁
+        if loop.needs_constant and rate > 0 and loop.until is None:  # then what the start adds is in f₁
             of_state = [pair for pair in gains.bounds.items() if pair[0][0] in "xy"]
             bounds += [Bound(output, arb(0), constant, False) for output, (_, constant) in of_state]
     if not all(size.is_finite() for bound in bounds for size in (bound.decaying, bound.constant)):
         raise RejectedError("bounds: not finite")
+    is_moved = loop.loads > 0 or loop.until is not None
+    if is_moved and any(bound.output.startswith("u[") for bound in bounds):
+        raise RejectedError("u: about a reference, or where the loop rests, the input is not an output")
     return Proof(rate, tuple(_about(loop, bound) for bound in bounds), apart, first, is_quiet)
 
 
@@ -391,8 +394,6 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
     output, starts = str(entry.get("output")), bool(entry.get("from_start", True))
     if not starts and loop.until is not None:
         raise RejectedError(f"{output[:50]}: no bound in the limit: the loop is known up to a time only")
-    if output[0:1] == "u" and loop.until is not None:
-        raise RejectedError(f"{output[:50]}: the input about a reference is not an output")
     counts = {"x": loop.n, "u": loop.B.ncols(), "y": loop.output_rows.nrows()}
     entries = {f"{kind}[{i}]" for kind, count in counts.items() for i in range(count)}
     if output not in {"x", "e_s", "e_c", "drift"} | entries:

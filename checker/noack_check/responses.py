@@ -36,7 +36,8 @@ class Decay(NamedTuple):
         """Raise RejectedError if this is not proven of a matrix."""
         P = self.form
         falls = -1 * (transpose(M) * P + P * M + 2 * self.rate * P)
-        if not (self.rate > 0 and is_positive(P) and is_positive(falls)):
+        has_inverse = all(P[i, i] > 0 for i in range(P.nrows()))  # beside is_positive
+        if not (self.rate > 0 and has_inverse and is_positive(P) and is_positive(falls)):
             raise RejectedError(f"{name}: not proven to decay so fast")
 
 

@@ -144,7 +144,7 @@ def _about_reference(loop: Loop, resolved: Table) -> Loop:
         )
     columns = [(size * columns_of(loop.B, [j])).entries() for j, size in enumerate(about.input)]
     columns += [(size * columns_of(identity(n), [i])).entries() for i, size in enumerate(about.state)]
-    columns = [column for column in columns if any(entry != 0 for entry in column)]
+    columns = [kept for column in columns for kept in _nonzero(column)]
     before = about.before_input + (loop.push_before_input or zeros(n, 1))
     added = arb_mat(n, len(columns), [column[i] for i in range(n) for column in columns])
     return loop._replace(

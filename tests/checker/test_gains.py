@@ -148,6 +148,9 @@ REJECTED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "a form that is not positive": (
         lambda document: document["gains"]["plant"].update(form=[[-1.0]]), "plant: not proven to decay",
     ),
+    "a form without rank": (
+        lambda document: document["gains"]["plant"].update(form=[[0.0]]), "plant: not proven to decay",
+    ),
     "inputs without coordinates": (lambda document: document["gains"].update(inputs=[[0.0]]), "inverse"),
     "inputs of another size": (lambda document: document["gains"].update(inputs=[[1.0, 0.0]]), "inputs"),
     "an unknown output": (lambda document: document["gains"].update(outputs=["x[7]"]), "outputs"),

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flint import arb
 
 from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
 from cosim.simulation.virtual_time import simulate
@@ -11,8 +12,9 @@ from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack_check.__main__ import check_file
 from noack_check.check import RejectedError
+from noack_check.document import read_number
 from noack_check.keys import RefusedError
-from noack_check.proof import prove
+from noack_check.proof import Bound, conclude, prove, prove_bound, read_assumptions
 from noack_check.scenario import read_loop
 from noack_check.sentences import origin_text
 from tests.checker.runs import floats
@@ -112,6 +114,19 @@ def test_the_shaft_has_a_proven_bound(statement: WitnessedStatement) -> None:
     assert bound.constant < 0.1
     assert statement.bounds.inter_event_s is not None
     assert statement.bounds.inter_event_s > 0.004
+
+
+def test_the_input_is_no_output_of_a_loop_about_its_rest(statement: WitnessedStatement) -> None:
+    """It is not 0 at rest, nor what the forms have before the first one acts."""
+    loop, document = read_loop(motor(), box=False, ideal=False), statement.document
+    assert document is not None
+    rate = read_number(document, "rate")
+    assumed, entries = read_assumptions(loop, rate, document), document["bounds"]
+    assert isinstance(entries, list)
+    bounds = [prove_bound(loop, rate, entry, assumed) for entry in entries]
+    assert conclude(loop, document, assumed, bounds).bounds
+    with pytest.raises(RejectedError, match=r"^u: about a reference, or where the loop rests"):
+        conclude(loop, document, assumed, [*bounds, Bound("u[0]", arb(1), arb(0), from_start=True)])
 
 
 def test_the_sentences_say_from_where_they_count(statement: WitnessedStatement) -> None:

@@ -11,6 +11,7 @@ from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolve
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import loop_of, resolve
+from noack.theory.witnesses.gains import find_by_gains
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
@@ -215,3 +216,13 @@ def test_a_loop_with_an_observer_is_about_its_reference() -> None:
         limit = bound.decaying * np.exp(-rate * t_ns * 1e-9) + bound.constant
         largest = max(largest, float((np.abs((rows["x"] - reference.states(t_ns))[:, 0]) / limit).max()))
     assert 0.1 < largest <= 1.0
+
+
+def test_gains_have_neither_the_input_nor_a_limit_about_a_reference() -> None:
+    loop = read_loop(servo(), box=False, ideal=False)._replace(push_before_input=None)
+    document: Any = find_by_gains(loop, ("x", "y[0]"))
+    proof = prove(loop, document)
+    assert {bound.from_start for bound in proof.bounds} == {True}
+    assert not prove(loop._replace(until=None), document).bounds[-1].from_start
+    with pytest.raises(RejectedError, match=r"^u: about a reference"):
+        prove(loop, {**document, "gains": {**document["gains"], "outputs": ["x", "u[0]"]}})
