@@ -9,6 +9,13 @@ the measured x, exactly, where x is measured. Sensor and controller predict (x, 
 and an update replaces both. So this is the loop of the paper for a plant with the states (x, ξ), and
 everything that is known of such loops holds for it. A resolved scenario has ξ in its matrices, at the
 end of the model's and of the plant's states, and u = Kx for its controller.
+
+With a set-point or a reference x_r the controller is driven by x − x_r. Then ξ_r solves
+dξ_r/dt = A_c ξ_r + B_c x_r, so (x_r, ξ_r) is a reference of the whole model, ξ − ξ_r is driven by x − x_r,
+and u = [D_c, C_c] (x − x_r, ξ − ξ_r) + u_r. At a set-point the ξ_r of an integral is a ramp.
+
+With an observer the sensor measures (Cx, ξ), and estimates x from Cx as without a controller: so B_c x has to
+follow from Cx.
 """
 
 from typing import TypeVar
@@ -18,13 +25,16 @@ import numpy as np
 from noack.controllers.linear_feedback import LinearFeedbackSettings
 from noack.controllers.state_space import StateSpaceSettings
 from noack.core.linear_systems import Matrix
+from noack.observers.luenberger import LuenbergerSettings
 from noack.scenario.loads import COMPARING_ERRORS, padded, with_weight
 from noack.scenario.scenario_tables import ScenarioTables
-from noack.scenario.sections import ModelSection, PlantSection, instability
-from noack.settings.section import require_shape, rows_of
+from noack.scenario.sections import AnyObserver, ModelSection, PlantSection, instability
+from noack.settings.section import MatrixRows, require_shape, rows_of
 from noack.trigger_policies.policy_settings import CombinedSettings
 
 S = TypeVar("S", bound=ScenarioTables)
+_ROUNDING = 1e-9
+"""What drives the controller is measured up to this share of it."""
 
 
 def check_controller_states(scenario: ScenarioTables) -> None:
@@ -39,19 +49,24 @@ def check_controller_states(scenario: ScenarioTables) -> None:
         controller.D, "controller.D", (m, n), "one row per input, one column per state of the model"
     )
     kind = f'not with controller.kind = "{controller.kind}"'
-    measurement = scenario.plant.measurement
-    unfit = {
-        "model.load": scenario.model.load is not None,
-        "observer": scenario.observer is not None,
-        "plant.measurement.C": measurement.C is not None and not measurement.selects_all(n),
-        "plant.measurement": measurement.is_noisy,
-        "controller.setpoint": any(controller.setpoint or ()),
-        "controller.reference": controller.reference is not None,
-    }
-    for key, is_set in unfit.items():
-        if is_set:
-            why = "; state the plant in deviations from it" if key.startswith("controller.") else ""
-            raise ValueError(f"{key}: {kind}, whose state is computed from the measured x{why}")
+    observer, measurement = scenario.observer, scenario.plant.measurement
+    if scenario.model.load is not None:
+        raise ValueError(f"model.load: {kind}; a load that the model knows needs no integral")
+    if measurement.is_noisy:
+        raise ValueError(f"plant.measurement: {kind}, whose state is computed from x without noise")
+    if observer is not None and not isinstance(observer, LuenbergerSettings):
+        raise ValueError(f'observer.kind: {kind}; take "luenberger"')
+    C, driving = measurement.matrix(n), np.array(controller.B)
+    if observer is not None and np.shape(C)[1] == n:
+        rest = driving - driving @ np.linalg.pinv(C) @ C
+        if np.abs(rest).max() > _ROUNDING * np.abs(driving).max():
+            raise ValueError(
+                "controller.B: it drives the controller by states that plant.measurement.C does not have; "
+                "take measured ones"
+            )
+    for index, change in enumerate(scenario.changes):
+        if "controller.setpoint" in change.set:
+            raise ValueError(f"changes.{index}.set: controller.setpoint: {kind}; give a controller.reference")
     policy = scenario.trigger.rule if isinstance(scenario.trigger, CombinedSettings) else scenario.trigger
     if policy.policy not in COMPARING_ERRORS:
         raise ValueError(
@@ -75,6 +90,7 @@ def with_controller_states(resolved: S) -> S:
     return resolved.model_copy(update={
         "model": controlled_model(resolved.model, controller),
         "plant": _controlled_plant(resolved.plant, controller),
+        "observer": _controlled_observer(resolved.observer, controller.states),
         "trigger": with_weight(resolved.trigger, *_weighed(resolved.model, controller)),
         "controller": LinearFeedbackSettings.model_construct(**shared),
     })  # fmt: skip
@@ -98,7 +114,7 @@ def _controlled_plant(plant: PlantSection, controller: StateSpaceSettings) -> Pl
     update: dict[str, object] = {
         "initial_state": (*plant.initial_state, *(0.0,) * k),
         "disturbances": tuple(padded(each, k) for each in plant.disturbances),
-        "measurement": plant.measurement.model_copy(update={"C": None}),
+        "measurement": plant.measurement.model_copy(update={"C": _measured(plant, k)}),
     }
     if plant.A is not None and plant.B is not None:
         update["A"] = rows_of(_with_states(np.array(plant.A), controller))
@@ -107,6 +123,30 @@ def _controlled_plant(plant: PlantSection, controller: StateSpaceSettings) -> Pl
         if (halfwidths := getattr(plant, key)) is not None:
             update[key] = rows_of(np.pad(np.array(halfwidths), ((0, k), (0, columns))))
     return plant.model_copy(update=update)
+
+
+def _measured(plant: PlantSection, k: int) -> MatrixRows | None:
+    """Return the rows of (Cx, ξ); None: all states are measured."""
+    C = plant.measurement.C
+    return None if C is None else _diagonal(np.array(C), np.eye(k))
+
+
+def _controlled_observer(observer: AnyObserver | None, k: int) -> AnyObserver | None:
+    """Return an observer of x, resolved, for (x, ξ) with ξ as it is measured."""
+    if not isinstance(observer, LuenbergerSettings):
+        return observer
+    gains = {name: getattr(observer, name) for name in ("gain", "first_gain")}
+    update: dict[str, object] = {
+        name: _diagonal(np.array(rows), np.eye(k)) for name, rows in gains.items() if rows is not None
+    }
+    if observer.initial_estimate is not None:
+        update["initial_estimate"] = (*observer.initial_estimate, *(0.0,) * k)
+    return observer.model_copy(update=update)
+
+
+def _diagonal(first: Matrix, second: Matrix) -> MatrixRows:
+    zeros = np.zeros((len(first), len(second.T)))
+    return rows_of(np.block([[first, zeros], [np.zeros((len(second), len(first.T))), second]]))
 
 
 def _with_states(A: Matrix, controller: StateSpaceSettings) -> Matrix:

@@ -14,12 +14,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from noack.controllers.state_space import StateSpaceSettings
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.references import ReferenceSegment
 from noack.references.file import FilePiece
 from noack.references.piece_settings import OutputPiece, OutputSignal, PieceSettings, joining
 from noack.references.segment import SolutionSegment
+from noack.scenario.controller_states import controlled_model
 from noack.scenario.scenario_tables import ScenarioTables
 
 _ROUNDING = 1e-9
@@ -44,18 +46,30 @@ class PieceError(ValueError):
 
 
 def scenario_segments(scenario: ScenarioTables) -> list[ReferenceSegment] | None:
-    """Return the segments of a scenario's reference, of the plant's n states; None if it has none.
+    """Return the segments of a scenario's reference, without loads; None if it has none.
+
+    They are those of a set-point, too, if the controller has states: these are not at rest there.
 
     Raises:
         PieceError: a piece is wrong, or the model cannot follow it.
     """
-    pieces, (A, B), n = scenario.controller.reference, scenario.model.matrices, scenario.model.plant_states
+    controller, given = scenario.controller, scenario.model
+    has_states = isinstance(controller, StateSpaceSettings)  # those of a resolved model are in its matrices
+    pieces, model = controller.reference, controlled_model(given, controller) if has_states else given
+    (A, B), n, own = model.matrices, model.followed_states, given.plant_states
+    A, B = A[:n, :n], B[:n]
     if pieces is None:
-        return None
-    states, _ = scenario.model.entry_names
-    rows = dict(zip(states[:n], np.eye(n), strict=True))
-    rows |= {output.name: np.array(output.row)[:n] for output in scenario.loop_outputs()}
-    return reference_segments(pieces, A[:n, :n], B[:n], rows, scenario.horizon_s)
+        if not controller.states or not any(controller.setpoint or ()):
+            return None
+        signals = [OutputSignal(np.array([value])) for value in controller.setpoint or ()]
+        return [_solution(A, B, np.eye(own, n), signals, 0, 1.0, np.zeros(n))]
+    if n > own and isinstance(pieces[0], FilePiece):
+        raise PieceError(0, "kind: a file has no states of the controller; give steps, ramps or sines")
+    states, _ = given.entry_names
+    rows = dict(zip(states[:own], np.eye(own, n), strict=True))
+    for output in scenario.loop_outputs():
+        rows[output.name] = np.pad(np.array(output.row)[:n], (0, max(n - len(output.row), 0)))
+    return reference_segments(pieces, A, B, rows, scenario.horizon_s)
 
 
 def reference_segments(

@@ -392,15 +392,15 @@ def _explicit_model(model: ModelSection) -> ModelSection:
 
 
 def _controller(scenario: Scenario) -> ControllerSettings:
-    """Return the controller with its reference, if it has one, as segments."""
+    """Return the controller with its reference, or the set-point of one with states, as segments."""
     controller = scenario.controller
-    if controller.reference is None or isinstance(controller.reference[0], FilePiece):
+    if isinstance((controller.reference or (None,))[0], FilePiece):
         return controller  # the rows of a file stay, which are shorter
-    segments = scenario_segments(scenario)
-    assert segments is not None
-    n = scenario.model.plant_states
+    if (segments := scenario_segments(scenario)) is None:
+        return controller
+    n = len(segments[0].polynomial.T) - scenario.model.dimensions[1]
     pieces = tuple(SolutionSegment.of(segment, n) for segment in segments)
-    return controller.model_copy(update={"reference": pieces})
+    return controller.model_copy(update={"reference": pieces, "setpoint": None})
 
 
 def _perturbation(
@@ -509,7 +509,7 @@ def reference_of(resolved: Scenario) -> Reference | None:
     """Return the reference of a resolved scenario: its pieces, or its set-point; None if it is 0."""
     segments, setpoint = scenario_segments(resolved), setpoint_of(resolved)
     if segments is not None:
-        (n, m), states = resolved.model.dimensions, resolved.model.plant_states
+        (n, m), states = resolved.model.dimensions, resolved.model.followed_states
         columns = [*range(states), *[-1] * (n - states), *range(states, states + m)]  # loads are 0
         return Reference([segment.of_columns(columns) for segment in segments], n)
     return None if setpoint is None else Reference.constant(*setpoint)

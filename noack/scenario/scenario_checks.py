@@ -64,10 +64,10 @@ def check_sections(scenario: ScenarioTables) -> None:
     _check_plant(scenario)
     m = scenario.model.dimensions[1]
     require_length(scenario.controller.safe_input, "controller.safe_input", m, "one per input")
+    check_controller_states(scenario)
     check_setpoint(scenario)
     check_loads(scenario)
     check_reference(scenario)
-    check_controller_states(scenario)
     _check_observer(scenario)
     _check_watchdog(scenario)
     _check_use_of_gain(scenario)

@@ -19,6 +19,7 @@ from noack.core.errors import CallerError, did_you_mean, printable, shortened
 from noack.core.file_access import shipped_files
 from noack.references.file import FilePiece
 from noack.scenario import toml_file
+from noack.scenario.integrals import with_integrals
 from noack.scenario.matrix_files import with_matrices
 from noack.scenario.overload import refuse_overload
 from noack.scenario.runtime_parameters import SHORT, full_key
@@ -150,7 +151,7 @@ def completed(content: ReadTable, path: Path, source: str | None = None) -> Scen
         raise CallerError(f"{source}: a file of links, not a scenario; `noack netem --links` takes it")
     if content.keys().isdisjoint(("loops", *LOOP_NEEDS)):
         raise CallerError(f"{source}: not a scenario: {', '.join(LOOP_NEEDS)} are missing")
-    content = with_matrices(content, path.parent, source)
+    content = with_integrals(with_matrices(content, path.parent, source), source)
     content = with_named_scenarios(content, path.parent, source)
     return _with_contents_of_files(validate(content, source), path, source)
 
@@ -241,7 +242,7 @@ def _loop_tables(path: Path, setting: str) -> Table:
     content = toml_file.read(path, Scenario)
     if content.get("loops"):
         raise CallerError(f"{setting}: that file has loops itself; name a file of one loop")
-    filled = with_matrices(content, path.parent, str(path))
+    filled = with_integrals(with_matrices(content, path.parent, str(path)), str(path))
     file = toml_file.validated(parts_model(frozenset(PARTS), others_optional=True), filled, str(path))
     tables = {
         place: with_absolute_path(table, path.parent, f"{path}: {place}")

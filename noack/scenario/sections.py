@@ -108,6 +108,9 @@ class ModelSection(ScenarioSection):
     hold: tuple[str, ...] | None = None
     """Names of the states that stay at 0, or at the set point, under a load that the input cannot
     cancel in every state; at most m."""
+    integral: str | tuple[str, ...] | None = None
+    """Outputs whose distances from the reference are integrated: the gain then has a column for each
+    integral, after those of the states, and is that of a controller with these states of its own."""
     load_states: Annotated[int, Field(ge=0, le=MAX_DIMENSION)] = 0
     """Number of the last states that are loads: a resolved scenario has them in its matrices, in
     place of load."""
@@ -130,6 +133,8 @@ class ModelSection(ScenarioSection):
         require_length(self.input_names, "input_names", m, "one name per input")
         self._check_loads(n)
         self._require_stable()
+        if self.integral is not None:  # loading a scenario replaces it
+            raise ValueError("integral: it is read where a scenario file is loaded; give a controller here")
         return self
 
     def _check_loads(self, n: int) -> None:
@@ -209,6 +214,11 @@ class ModelSection(ScenarioSection):
     def plant_states(self) -> int:
         """Number of states that are neither loads nor the controller's."""
         return self.dimensions[0] - self.load_states - self.controller_states
+
+    @property
+    def followed_states(self) -> int:
+        """Number of states that a reference has: all but the loads."""
+        return self.dimensions[0] - self.load_states
 
     @property
     def loads(self) -> int:

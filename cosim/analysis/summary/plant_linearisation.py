@@ -6,11 +6,10 @@ from numpy.typing import ArrayLike
 from cosim.analysis.summary.summary_model import LinearisationPart, NoLinearisationPart
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
-from noack.plants.plant_settings import PlantSystem
+from noack.plants.plant_settings import PlantStart, PlantSystem
 from noack.plants.systems.linearisation import NO_STATE, STEP_NS, linearise
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from plant_server.plant import system_of
 
 Linearisation = LinearisationPart | NoLinearisationPart
 _EXACT = 1e-3
@@ -23,17 +22,18 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
     Its fields: ``A`` and ``B`` by rows; ``eigenvalues`` of A + BK as pairs of real and imaginary
     part; ``off_A`` and ``off_B``, A − Â and B − B̂; ``in_box``, whether these are within the
     half-widths of the scenario's uncertainty box, None without a box. If x is not the whole state,
-    the only field is ``A``, with the value None.
+    the only field is ``A``, with the value None. A and B are those of the plant's own states; A + BK has
+    the controller's states, too, and no loads.
     """
     if resolved.coverage.is_linear:
         return None
-    loop, plant = loop_of(resolved), resolved.plant
+    loop, plant = loop_of(resolved).without_loads, resolved.plant
+    n, m = resolved.model.plant_states, loop.m
+    A_model, B_model = loop.A_model[:n, :n], loop.B_model[:n]
 
     def system_at(x0: Vector) -> PlantSystem:
-        started = plant.model_copy(update={"initial_state": tuple(x0.tolist())})
-        return system_of(resolved.model_copy(update={"plant": started}))
+        return plant.system.system(PlantStart(x0, A_model, B_model, resolved.timing.plant_period_ns))
 
-    n, m = loop.n, loop.m
     try:
         with np.errstate(all="ignore"):
             if (exact := plant.system.linearisation()) is not None:
@@ -47,8 +47,10 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
         A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):
         return NoLinearisationPart(A=None)
-    off_A, off_B = A - loop.A_model, B - loop.B_model
-    poles = np.linalg.eigvals(A + B @ loop.K)
+    off_A, off_B = A - A_model, B - B_model
+    whole = loop.A_model + loop.B_model @ loop.K
+    whole[:n] += np.pad(off_A, ((0, 0), (0, loop.n - n))) + off_B @ loop.K
+    poles = np.linalg.eigvals(whole)
     in_box: bool | None = None
     if plant.uncertainty_A is not None or plant.uncertainty_B is not None:
         in_box = _is_within(off_A, plant.uncertainty_A) and _is_within(off_B, plant.uncertainty_B)
@@ -63,7 +65,9 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
 
 
 def _is_within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
-    allowed = np.zeros_like(off) if halfwidth is None else np.array(halfwidth)
+    """Whether entries are within half-widths, of which further rows and columns are those of other states."""
+    rows, columns = off.shape
+    allowed = np.zeros_like(off) if halfwidth is None else np.array(halfwidth)[:rows, :columns]
     return bool((np.abs(off) <= np.maximum(allowed, _EXACT)).all())
 
 

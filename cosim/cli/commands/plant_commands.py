@@ -75,6 +75,7 @@ def linearise(
         ("noack gain cart_pole --q 10,1,10,1 --r 0.1", "a regulator for these weights"),
         ("noack gain pole.json --out pole.json", "add a gain to a model that linearise wrote"),
         ("noack gain cart_pole --poles=-2,-3,-4,-5 --json", "given poles, as JSON"),
+        ("noack gain servo_reference --integral angle", "with integral action: no steady-state error"),
     ),
 )
 def gain(
@@ -92,6 +93,14 @@ def gain(
     poles: Annotated[
         str | None,
         Option(help="Eigenvalues of Â + B̂K instead, e.g. --poles=-1,-2,-3+1j,-3-1j."),
+    ] = None,
+    integral: Annotated[
+        str | None,
+        Option(
+            metavar="NAME",
+            help="Integrate r − y of these outputs or states, e.g. angle: K, --q and --poles have an "
+            "entry more for each.",
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -111,6 +120,7 @@ def gain(
         q=_numbers("--q", q),
         r=_numbers("--r", r),
         poles=_numbers("--poles", poles, complex),
+        integral=() if integral is None else integral.split(","),
         settings=_table(settings),
     )
     if out is not None:

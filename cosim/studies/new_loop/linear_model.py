@@ -1,8 +1,8 @@
 """The linear model of a plant at a point, and the gain of a loop with it."""
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -21,6 +21,7 @@ from noack.core.number_format import TextRows, as_text, to_digits
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
 from noack.plants.systems.linearisation import linearise as linear_motion
 from noack.scenario.given_settings import given_settings
+from noack.scenario.integrals import augmented, require_held
 from noack.scenario.sections import instability
 from noack.settings.section import ReadTable, Table
 from noack.settings.user_files import UserCode
@@ -177,17 +178,20 @@ class LinearModel:
 class LoopGain:
     """A linear model and the gain ``K``, (m, n), of u = K x; ``eigenvalues`` are those of A + BK.
 
-    ``method`` says how K was computed.
+    ``method`` says how K was computed. With ``integrals``, the rows of k outputs by their names, K is
+    (m, n + k), its last columns those of ∫(r − y), and A and B are those of n + k states.
     """
 
     model: LinearModel
     K: Matrix
     method: str
+    integrals: Mapping[str, Vector] = field(default_factory=dict)
 
     @property
     def eigenvalues(self) -> Complex:
         """Eigenvalues of A + BK, per second, the largest real part first."""
-        return eigenvalues(self.model.A + self.model.B @ self.K)
+        A, B = _with_integrals(self.model, self.integrals)
+        return eigenvalues(A + B @ self.K)
 
     @property
     def decay_per_s(self) -> float:
@@ -198,6 +202,7 @@ class LoopGain:
         """Return the document of ``noack gain --json``: that of the model, and the gain."""
         return self.model.to_json() | {
             "gain": self.K.tolist(),
+            **({"integral": [*self.integrals]} if self.integrals else {}),
             "method": self.method,
             "closed_loop_eigenvalues": _real_and_imaginary(self.eigenvalues),
             "alpha_below_per_s": self.decay_per_s,
@@ -205,11 +210,13 @@ class LoopGain:
 
     def __repr__(self) -> str:
         plant = self.model.plant
+        names = [*plant.state_names, *(f"∫(r − {name})" for name in self.integrals)]
+        integral = f", integral = {json.dumps([*self.integrals])}" if self.integrals else ""
         return "\n".join(
             [
-                _matrix_text("K", self.K, plant.input_names, plant.state_names),
-                f"u = K x; {self.method}",
-                f"in a scenario's [model]: gain = {self.K.tolist()}",
+                _matrix_text("K", self.K, plant.input_names, names),
+                f"u = K x{', and the integrals' if self.integrals else ''}; {self.method}",
+                f"in a scenario's [model]: gain = {self.K.tolist()}{integral}",
                 f"Â and B̂ are computed from {self.model.origin}",
                 f"eigenvalues of Â + B̂K: {eigenvalue_text(self.eigenvalues)} /s",
                 f"trigger.alpha_per_s must be below {self.decay_per_s:.4g}; half of it is usual",
@@ -297,6 +304,7 @@ def gain(
     q: ArrayLike | None = None,
     r: ArrayLike | None = None,
     poles: Sequence[complex] | None = None,
+    integral: str | Sequence[str] = (),
     settings: ReadTable | None = None,
 ) -> LoopGain:
     """Compute the gain K of u = K x: a linear-quadratic regulator, or given eigenvalues.
@@ -308,14 +316,20 @@ def gain(
         q: weight of the states in ∫ xᵀQx + uᵀRu dt: a number, or the diagonal; by default 1.
         r: weight of the inputs, likewise.
         poles: the eigenvalues of the controllable part of A + BK instead, per second.
+        integral: outputs or states whose distances from the reference are integrated: K has a column
+            for each after those of the states, and q and poles have entries for them.
         settings: as for :func:`linearise`.
 
     Raises:
-        NoackError: an unstable eigenvalue is not controllable, or a value is wrong.
+        NoackError: an unstable eigenvalue is not controllable, an output cannot be held, or a value is
+            wrong.
     """
     model = plant if isinstance(plant, LinearModel) else linearise(plant, settings=settings)
     if model is not plant and (known := model.plant.model_matrices) is not None:
         model = replace(model, A=known[0], B=known[1], source="known")
+    plain, integrals = model, _integrals(model, [integral] if isinstance(integral, str) else integral)
+    A, B = _with_integrals(model, integrals)
+    model = replace(model, A=A, B=B)  # of the states and the integrals
     label, uncontrollable = model.plant.label, model.uncontrollable
     if len(uncontrollable) and uncontrollable[0].real >= 0:
         worst = eigenvalue_text(uncontrollable[:1])
@@ -335,7 +349,29 @@ def gain(
     K = np.array([[to_digits(value, _GAIN_DIGITS) for value in row] for row in K])
     if (reason := instability(model.A, model.B, K)) is not None:
         raise CallerError(f"{label}: {reason}")
-    return LoopGain(model, K, method)
+    return LoopGain(plain, K, method, integrals)
+
+
+def _integrals(model: LinearModel, names: Sequence[str]) -> Mapping[str, Vector]:
+    """Return the rows of outputs by their names; raise CallerError if one cannot be held."""
+    rows = dict(zip(model.plant.state_names, np.eye(len(model.A)), strict=True)) | dict(model.plant.outputs)
+    for name in names:
+        if name not in rows:
+            raise CallerError(
+                f"integral {name}: no output or state of this name; these are {', '.join(rows)}"
+            )
+    chosen = {name: rows[name] for name in names}
+    try:
+        require_held(model.A, model.B, chosen)
+    except ValueError as error:
+        raise CallerError(f"integral: {error}") from None
+    return chosen
+
+
+def _with_integrals(model: LinearModel, integrals: Mapping[str, Vector]) -> tuple[Matrix, Matrix]:
+    """Return A and B of a model's states, and of the integrals of outputs."""
+    n = len(model.A)
+    return augmented(model.A, model.B, np.array([*integrals.values()]).reshape(-1, n))
 
 
 def _place_poles(model: LinearModel, poles: Complex) -> Matrix:
@@ -468,13 +504,18 @@ def model_or_gain(plant: str | PathLike[str], settings: ReadTable | None) -> Lin
     gain_rows = document["gain"]
     if not isinstance(gain_rows, list) or not all(isinstance(row, list) for row in gain_rows):
         raise CallerError(f"{plant}: gain: expected a list of rows")
-    rows = [parse_vector("gain", row, len(model.A), "states") for row in gain_rows]
+    names = document.get("integral", [])
+    if not isinstance(names, list):
+        raise CallerError(f"{plant}: integral: expected a list of names")
+    integrals = _integrals(model, names)
+    meaning = "states and integrals" if integrals else "states"
+    rows = [parse_vector("gain", row, len(model.A) + len(integrals), meaning) for row in gain_rows]
     if len(rows) != model.plant.m:
         raise CallerError(f"{plant}: gain: {len(rows)} rows; the plant has {model.plant.m} inputs")
     K = np.array(rows)
-    if (reason := instability(model.A, model.B, K)) is not None:
+    if (reason := instability(*_with_integrals(model, integrals), K)) is not None:
         raise CallerError(f"{plant}: gain: {reason}")
-    return LoopGain(model, K, str(document.get("method", "given")))
+    return LoopGain(model, K, str(document.get("method", "given")), integrals)
 
 
 def _matrix_text(name: str, matrix: Matrix, rows: Sequence[str], columns: Sequence[str]) -> str:

@@ -328,6 +328,7 @@ class _TrialScenarios:
                 "A": model.A.tolist(),
                 "B": model.B.tolist(),
                 "gain": trial.gain.K.tolist(),
+                **({"integral": [*trial.gain.integrals]} if trial.gain.integrals else {}),
                 "state_names": list(reference.state_names),
                 "input_names": list(reference.input_names),
             },
@@ -457,7 +458,8 @@ class _TrialScenarios:
         if candidates:
             return min(candidates, key=lambda entry: entry[0])[1]
         report("choosing a norm")
-        with_norm = self._weighted(closest[1]) if math.isfinite(closest[0]) else None
+        is_possible = math.isfinite(closest[0]) and not closest[1].gain.integrals  # W is of the states alone
+        with_norm = self._weighted(closest[1]) if is_possible else None
         return trials[0] if with_norm is None else with_norm
 
     def _weighted(self, trial: _Trial) -> _Trial | None:

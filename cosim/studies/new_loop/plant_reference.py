@@ -59,6 +59,8 @@ class PlantReference:
     """A and B of a linear plant."""
     model_matrices: tuple[Matrix, Matrix] | None = None
     """Â and B̂ of its model, which sensor and controller use."""
+    outputs: Mapping[str, Vector] = field(default_factory=dict)
+    """The rows of a scenario's outputs, (n,), by their names."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -191,10 +193,13 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
         scenario_file.put(content, key, value, f"--set {key}")
     if isinstance(model := content.get("model"), dict):  # its gain does not matter, and may be missing
         model["allow_unstable"] = True
+        if model.pop("integral", None) is not None:
+            model.pop("gain", None)
         if isinstance(B := model.get("B"), list) and B and isinstance(B[0], list):
             model.setdefault("gain", [[0.0] * len(B)] * len(B[0]))
+    content.pop("controller", None)  # its states are not the plant's
     resolved = resolve(scenario_file.completed(content, path))
-    loop, plant = loop_of(resolved), resolved.plant
+    loop, plant = loop_of(resolved).without_loads, resolved.plant
     return PlantReference(
         label=label,
         settings=settings,
@@ -203,9 +208,10 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
         m=loop.m,
         names=(loop.state_names, loop.input_names),
         rates={"rate_hz": plant.rate_hz, "measure_every": plant.measure_every},
-        initial_state=plant.initial_state,
+        initial_state=plant.initial_state[: loop.n],
         matrices=(loop.A, loop.B) if resolved.coverage.is_linear else None,
         model_matrices=(loop.A_model, loop.B_model) if resolved.coverage.is_linear else None,
+        outputs={output.name: np.array(output.row) for output in loop.outputs},
     )
 
 

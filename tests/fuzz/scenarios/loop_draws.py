@@ -87,8 +87,13 @@ def loop(of: Chances, *, acknowledged: bool) -> tuple[Table, Model]:
 def controller_states(of: Chances, model: Model, content: Table) -> None:
     """Replace the controller of a loop without an observer by one that filters x, and adds the result."""
     k, table = of.integer(1, 2), dict(content.get("controller", {}))
-    for key in ("kind", "setpoint", "file", "name", "parameters"):
+    for key in ("kind", "file", "name", "parameters"):
         table.pop(key, None)
+    if any(piece["kind"] == "file" for piece in table.get("reference", [])):
+        del table["reference"]
+    if of.flag():
+        content["controller"] = table
+        return integral(of, model, content)
     matrices = {
         "A": -of.between(1.0, 5.0) * np.eye(k),
         "B": 0.1 * np.eye(k, model.n),
@@ -102,6 +107,18 @@ def controller_states(of: Chances, model: Model, content: Table) -> None:
         file = of.file("controller", ".npz", npz(matrices))
         content["controller"] = {"kind": "state_space", "file": file, **table}
     content["trigger"] = {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.2, "floor": 0.05}
+
+
+def integral(of: Chances, model: Model, content: Table) -> None:
+    """Add the integral of a state that the input can move, with a slow and stable gain."""
+    names = [f"state {index}" for index in range(model.n)]
+    moved = np.linalg.pinv(model.A + model.B @ model.K) @ model.B
+    index = int(np.argmax(np.linalg.norm(moved, axis=1)))
+    direction = moved[index] / max(np.linalg.norm(moved[index]), 1e-9) ** 2
+    gain = np.hstack([model.K, -0.05 * direction[:, None]])
+    given = of.one_of(names[index], [names[index]])
+    content["model"] |= {"state_names": names, "integral": given, "gain": gain.tolist()}
+    content["trigger"] = {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.02, "floor": 0.05}
 
 
 def loads(of: Chances, model: Model, content: Table) -> None:

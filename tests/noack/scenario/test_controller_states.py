@@ -9,9 +9,11 @@ from scipy.integrate import solve_ivp
 from scipy.signal import StateSpace
 
 import noack
+from cosim.analysis.witnesses import resolved_content
 from noack.plants.systems.traced_equations import NotEnclosedError
 from noack.scenario.resolution import loop_of, resolve
 from noack.theory.certificates.plant_equations import equations_of
+from noack_check.scenario import read_loop
 
 A, B, K = np.array([[0.0, 1.0], [0.0, -2.0]]), np.array([[0.0], [5.0]]), np.array([[-6.0, -1.2]])
 INTEGRAL = {"kind": "state_space", "A": [[0.0]], "B": [[1.0, 0.0]], "C": [[-8.0]]}
@@ -25,6 +27,12 @@ LOOP = {
     "network": {"mansd": 3, "loss": {"model": "bernoulli", "probability": 0.5}},
 }
 """A servo with the integral of its angle."""
+OBSERVER = {"kind": "luenberger", "poles_per_s": [-28.0, -29.0]}
+LOAD = {"kind": "step", "at": "input", "amplitude": [0.3], "from_s": 0.0}
+PIECES = [
+    {"kind": "step", "output": "angle", "value": 1.0, "from_s": 1.0, "join_s": 1.0},
+    {"kind": "sine", "output": "angle", "amplitude": 0.2, "hz": 0.2, "from_s": 6.0, "join_s": 1.0},
+]
 
 
 def test_a_resolved_scenario_has_the_states_of_the_controller() -> None:
@@ -108,6 +116,63 @@ def test_files_and_objects_give_the_same_controller(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "settings",
+    [{"controller.setpoint": [1.0, 0.0]}, {"controller.reference": PIECES}],
+    ids=["set-point", "pieces"],
+)
+def test_it_follows_a_reference_under_a_load(settings: dict[str, object]) -> None:
+    """About the reference the loop is the one that starts at x(0) − x_r(0) without it."""
+    more = {"plant.disturbances": [LOAD], "horizon_s": 12.0}
+    scenario = noack.load(LOOP, {**more, **settings})
+    start = loop_of(resolve(scenario)).reference
+    assert start is not None
+    run = noack.simulate(scenario)
+    samples = run.samples()
+    times_ns = np.round(np.asarray(samples["t_s"]) * 1e9).astype(np.int64)
+    distance = np.array([samples[f"x_{index}"] for index in (1, 2, 3)]).T - start.states(times_ns)
+    assert np.abs(distance[-2500:, 0]).max() < 0.006  # about the threshold, and what a held u_r lags behind
+    assert run.replay().bit_exact
+    if "controller.setpoint" in settings:
+        moved = (np.array([0.5, 0.0]) - start.state(0)[:2]).tolist()
+        without = noack.simulate(noack.load(LOOP, {**more, "plant.initial_state": moved})).samples()
+        expected = np.array([without[f"x_{index}"] for index in (1, 2, 3)]).T
+        assert np.abs(distance - expected).max() < 1e-9
+
+
+def test_the_reference_of_the_controllers_state_solves_its_equation() -> None:
+    """ξ_r is continuous, and its slope is A_c ξ_r + B_c x_r."""
+    reference = loop_of(
+        resolve(noack.load(LOOP, {"controller.reference": PIECES, "horizon_s": 12.0}))
+    ).reference
+    assert reference is not None
+    t_ns = np.arange(0, 12_000_000_000, 1_000_000)
+    x_r = reference.states(t_ns)
+    assert np.abs(np.diff(x_r, axis=0)).max() < 0.01
+    slope = np.diff(x_r[:, 2]) / 1e-3
+    assert np.abs(slope - (x_r[1:, 0] + x_r[:-1, 0]) / 2).max() < 1e-5
+
+
+def test_an_observer_estimates_the_plant_and_takes_the_controllers_state_as_it_is() -> None:
+    settings = {"observer": OBSERVER, "plant.measurement.C": [[1.0, 0.0]]}
+    scenario = resolve(noack.load(LOOP, settings))
+    assert scenario.plant.measurement.C == ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    run = noack.simulate(noack.load(LOOP, {**settings, "plant.disturbances": [LOAD], "horizon_s": 12.0}))
+    assert np.abs(np.asarray(run.samples()["x_1"])[-2500:]).max() < 0.012
+    assert run.replay().bit_exact
+
+
+def test_the_checker_reads_it_with_an_observer_about_a_reference() -> None:
+    """ξ is measured, so the observer's error has none of it."""
+    settings = {"observer": OBSERVER, "plant.measurement.C": [[1.0, 0.0]], "controller.reference": PIECES}
+    content = resolved_content(resolve(noack.load(LOOP, {**settings, "horizon_s": 12.0})), 2)
+    loop = read_loop(content, box=False, ideal=False)
+    assert loop.fault() == ""
+    assert loop.until == 12
+    assert loop.observer is not None
+    assert not any(entry != 0 for entry in loop.observer.correction.tolist()[2])
+
+
+@pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"controller.B": [[1.0]]}, "expected 1 x 2 (one column per state of the model)"),
@@ -116,9 +181,12 @@ def test_files_and_objects_give_the_same_controller(tmp_path: Path) -> None:
         ({"controller.A": [[0.0, 1.0]]}, "the controller's matrix A is square"),
         ({"controller.A": None}, "give the matrices A, B and C"),
         ({"controller.C": [[8.0]]}, "with its states, u = K x does not stabilise"),
-        ({"controller.setpoint": [1.0, 0.0]}, "state the plant in deviations from it"),
         ({"plant.measurement.noise_std": [0.1, 0.1]}, "not with controller.kind"),
-        ({"observer": {"kind": "luenberger", "poles_per_s": [-8.0, -9.0]}}, "not with controller.kind"),
+        ({"observer": {"kind": "kalman", "initial_std": [0.5, 0.5]}}, 'take "luenberger"'),
+        ({"observer": OBSERVER, "plant.measurement.C": [[0.0, 1.0]]}, "states that plant.measurement.C does"),
+        ({"changes": [{"at_s": 1.0, "set": {"controller.setpoint": [1.0, 0.0]}}]}, "give a controller.ref"),
+        ({"controller.reference": [{"kind": "file", "t_s": [0, 6], "x": [[0, 0]] * 2, "u": [[0]] * 2}]},
+         "a file has no states of the controller"),
         ({"model.load": "input"}, "not with controller.kind"),
         ({"trigger": {"policy": "relative", "sigma": 0.1}}, '"relative" compares with x'),
         ({"controller.file": "nothing.npz", "controller.A": None}, "the file has B, and so has the scenario"),
