@@ -18,11 +18,8 @@ FILE = "scenario.toml"
 _LOOP_SEEDS = ("plant", "initial_state", "disturbance", "noise")
 
 NEVER_DRAWN: Mapping[str, str] = {
-    "LoopSection.outputs": "the table of a scenario with one loop",
     "ModelSection.load_states": "of resolved scenarios, which have the loads in their matrices",
     "ModelSection.controller_states": "of resolved scenarios, which have these states in their matrices",
-    "StateSpaceSettings.setpoint": "refused: the state is computed from the measured x",
-    "StateSpaceSettings.reference": "refused: the state is computed from the measured x",
     "PythonControllerSettings.sha256": "the user's own copy in a run directory",
     "PythonPlantSettings.sha256": "the user's own copy in a run directory",
     "PythonTriggerSettings.sha256": "the user's own copy in a run directory",
@@ -87,12 +84,14 @@ def _follow(of: Chances, content: Table, model: Model) -> None:
     controller, names = content.setdefault("controller", {}), content["model"].get("state_names")
     moved = any("setpoint" in key for change in content.get("changes", ()) for key in change["set"])
     carries_model = content["plant"].get("watchdog", {}).get("policy") == "model"
-    if moved or carries_model or "setpoint" in controller or controller.get("kind", "linear") != "linear":
+    kind = controller.get("kind", "linear")
+    if moved or carries_model or "setpoint" in controller or kind not in ("linear", "state_space"):
         return
+    has_states = kind == "state_space" or "integral" in content["model"]  # a file does not have them
     if "name" in content["model"]:
         names = names or NAMED_MODELS[content["model"]["name"]]().state_names
     names = names or [f"x_{i}" for i in range(1, model.n + 1)]
-    if of.chance(0.2):
+    if of.chance(0.2) and not has_states:
         inputs = content["model"].get("input_names") or [f"u_{i}" for i in range(1, model.m + 1)]
         if "name" in content["model"]:
             return

@@ -89,11 +89,10 @@ def controller_states(of: Chances, model: Model, content: Table) -> None:
     k, table = of.integer(1, 2), dict(content.get("controller", {}))
     for key in ("kind", "file", "name", "parameters"):
         table.pop(key, None)
-    if any(piece["kind"] == "file" for piece in table.get("reference", [])):
-        del table["reference"]
     if of.flag():
         content["controller"] = table
-        return integral(of, model, content)
+        integral(of, model, content)
+        return
     matrices = {
         "A": -of.between(1.0, 5.0) * np.eye(k),
         "B": 0.1 * np.eye(k, model.n),
