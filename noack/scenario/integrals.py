@@ -146,7 +146,7 @@ def _numbers(model: ReadTable) -> tuple[Matrix, Matrix, Sequence[str]] | None:
             named = NAMED_MODELS[name](**parameters)
         except TypeError:
             return None
-        return named.A, named.B, given if _are_names(given, len(named.A)) else named.state_names
+        return named.A, named.B, _names(given, named.state_names)
     A, B = _matrix(model.get("A")), _matrix(model.get("B"))
     if A is None or B is None or A.shape != (len(B), len(B)):
         return None

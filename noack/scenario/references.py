@@ -54,8 +54,9 @@ def scenario_segments(scenario: ScenarioTables) -> list[ReferenceSegment] | None
         PieceError: a piece is wrong, or the model cannot follow it.
     """
     controller, given = scenario.controller, scenario.model
-    has_states = isinstance(controller, StateSpaceSettings)  # those of a resolved model are in its matrices
-    pieces, model = controller.reference, controlled_model(given, controller) if has_states else given
+    pieces, model = controller.reference, given
+    if isinstance(controller, StateSpaceSettings):  # a resolved model has these states in its matrices
+        model = controlled_model(given, controller)
     (A, B), n, own = model.matrices, model.followed_states, given.plant_states
     A, B = A[:n, :n], B[:n]
     if pieces is None:
