@@ -150,13 +150,14 @@ def _numbers(model: ReadTable) -> tuple[Matrix, Matrix, Sequence[str]] | None:
     A, B = _matrix(model.get("A")), _matrix(model.get("B"))
     if A is None or B is None or A.shape != (len(B), len(B)):
         return None
-    return A, B, given if _are_names(given, len(A)) else entry_names("x", len(A))
+    return A, B, _names(given, entry_names("x", len(A)))
 
 
-def _are_names(names: object, n: int) -> bool:
-    return (
-        isinstance(names, list | tuple) and len(names) == n and all(isinstance(each, str) for each in names)
-    )
+def _names(given: object, default: Sequence[str]) -> Sequence[str]:
+    """Return the names of the states, or the default if these are no names of as many."""
+    if not isinstance(given, list | tuple) or len(given) != len(default):
+        return default
+    return [str(name) for name in given]
 
 
 def _outputs(entries: object, states: Sequence[str]) -> dict[str, Vector]:
