@@ -83,6 +83,11 @@ class Certificates:
 
     Iteration yields each certificate with the conditions that it assumes: IDEAL or SCHEDULE.
 
+    >>> import noack
+    >>> certificate = noack.certify("double_integrator").schedule
+    >>> certificate.state([0.0, 5.0]).shape  # a bound of ‖x(t)‖ for each time
+    (2,)
+
     Args:
         scenario: the resolved scenario.
         late_periods: allowed lateness in steps of the plant.

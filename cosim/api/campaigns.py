@@ -30,7 +30,15 @@ _TABLE = Path("campaign")
 
 
 class CampaignResult:
-    """A finished campaign; :func:`noack.campaign` returns it."""
+    """A finished campaign; :func:`noack.campaign` returns it.
+
+    >>> import noack
+    >>> axis = {"name": "loss", "key": "network.loss.probability", "values": [0.2, 0.8]}
+    >>> table = {"name": "losses", "scenario": "double_integrator", "draws": 5, "axes": [axis]}
+    >>> result = noack.campaign(table | {"settings": {"horizon_s": 2.0}})
+    >>> result.draws(loss=0.8).num_rows, result.breaches  # a row of each draw at a point of the grid
+    (5, 0)
+    """
 
     def __init__(self, finished: FinishedCampaign, temporary: Path | None = None) -> None:
         self._finished = finished

@@ -49,7 +49,15 @@ class Run:
     """A completed run: its settings, its summary, its record.
 
     :func:`noack.simulate`, :func:`noack.run` and :func:`noack.open_run` return one. Without the
-    argument ``runs``, the run is in a temporary folder, which exists as long as this object.
+    argument ``runs``, the run is in a temporary folder, which exists as long as this object. Of n
+    states and m inputs, ``samples()`` has columns for each.
+
+    >>> import noack
+    >>> run = noack.simulate(noack.load("double_integrator", {"horizon_s": 2.0}))
+    >>> run.ok, run.reason, run.summary.loops[0].longest_loss_burst
+    (True, 'horizon', 4)
+    >>> {claim.verdict.value for claim in run.claims}
+    {'held'}
     """
 
     directory: Path
@@ -353,6 +361,11 @@ def run(
     the run is interrupted (Ctrl-C), it is finalised and returned. ``ok`` is then false, as for a
     run in which a process died.
 
+    >>> import noack
+    >>> run = noack.run(noack.load("double_integrator", {"horizon_s": 0.5}))
+    >>> run.reason
+    'horizon'
+
     Args:
         scenario: a scenario, or a source that :func:`noack.load` accepts.
         runs: folder for the run directory; without it, a temporary folder.
@@ -379,6 +392,11 @@ def run(
 def open_run(directory: PathLike = "runs/latest") -> Run:
     """Open an earlier run, live or simulated; finalise an interrupted run first.
 
+    >>> import noack
+    >>> simulated = noack.simulate(noack.load("lane_acknowledged", {"horizon_s": 1.0}))
+    >>> noack.open_run(simulated.directory).ok
+    True
+
     Args:
         directory: a run directory. ``runs/latest`` is the newest one in ``runs``.
 
@@ -396,6 +414,12 @@ def open_run(directory: PathLike = "runs/latest") -> Run:
 
 def compare(*runs: Run | PathLike) -> RunComparison:
     """Compare two or more runs.
+
+    >>> import noack
+    >>> scenario = noack.load("lane_acknowledged", {"horizon_s": 2.0})
+    >>> two = [noack.simulate(noack.with_settings(scenario, {"trigger.beta": b})) for b in (0.1, 0.4)]
+    >>> noack.compare(*two).numbers[1]
+    KeyNumber(name='transmissions', values=(9, 6))
 
     Args:
         runs: two to seven, each as a :class:`Run` or a run directory, live or simulated.

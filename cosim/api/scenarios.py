@@ -66,7 +66,12 @@ def load(
 
 
 def scenarios() -> dict[str, str]:
-    """Return the texts of the scenarios that come with noack, by name, to be copied and edited."""
+    """Return the texts of the scenarios that come with noack, by name, to be copied and edited.
+
+    >>> import noack
+    >>> 'name = "lane_following"' in noack.scenarios()["lane_following"]
+    True
+    """
     return {name: text_of(name) for name in shipped_names("scenarios")}
 
 
@@ -109,6 +114,12 @@ def from_system(
     Without ``settings``, these values are chosen: the trigger's α is half the decay rate of Â +
     B̂K; its β is a tenth of ‖x(0)‖ (0.1 if x(0) = 0); the horizon is the time in which e^(−αt)
     falls to a hundredth. Each has three digits. M − 1 is 4, and half of the updates are lost.
+
+    >>> import noack
+    >>> A, B = [[0.0, 1.0], [2.0, -0.5]], [[0.0], [1.0]]
+    >>> scenario = noack.from_system((A, B), gain=[[-6.0, -4.0]], initial_state=[1.0, 0.0])
+    >>> scenario.trigger.alpha_per_s, scenario.trigger.beta, scenario.horizon_s
+    (0.61, 0.1, 7.55)
 
     Args:
         system: the model ẋ = Âx + B̂u as a tuple (A, B) of matrices (n, n), per second, and (n, m);

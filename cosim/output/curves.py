@@ -40,7 +40,12 @@ _PANELS: dict[Quantity, str] = {"e_c": ERRORS, "x": STATE_NORM, "inter_event": I
 
 
 class CurveStyle(NamedTuple):
-    """How a curve is drawn."""
+    """How a curve is drawn.
+
+    >>> import noack
+    >>> noack.CurveStyle((27, 31, 36), width=2.0).marker
+    ''
+    """
 
     colour: Colour
     """Red, green and blue, 0 to 255."""
@@ -56,7 +61,15 @@ class CurveStyle(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A quantity of a run over time."""
+    """A quantity of a run over time, t in seconds; :meth:`noack.Run.curves` returns a list of them.
+
+    >>> import noack
+    >>> curves = noack.simulate_exactly("lane_following").curves()
+    >>> [curve.name for curve in curves if curve.panel == "error norms"]
+    ['‖e_c‖ controller', '‖e_s‖ sensor', 'threshold']
+    >>> curves[0].t_s.shape == curves[0].values.shape
+    True
+    """
 
     panel: str
     """What is shown; curves with the same panel share their axes."""

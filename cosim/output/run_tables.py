@@ -318,7 +318,7 @@ def claims_in_full(claims: Claims) -> ResultTable:
         share = NONE if claim.ratio is None else f"{number(100 * claim.ratio)} %"
         numbers = (
             claim.certified_text or NONE,
-            NONE if claim.observed is None else number(claim.observed),
+            number(claim.observed, 4),
             share,
         )
         rows.append((what, claim.origin, claim.bound, *numbers, claim.why, claim.verdict + since))

@@ -142,7 +142,8 @@ def address_of(pointer: CData) -> int:
 def new_structure(kind: str, numbers: Mapping[str, object] = MappingProxyType({})) -> CData:
     """Return a new structure of the core with these numbers, which functions of the core copy.
 
-    >>> new_structure("noack_signal", {"width": 2, "values": np.ones((3, 2))}).values[5]
+    >>> signal = new_structure("noack_signal", {"width": 2, "values": np.ones((3, 2))})
+    >>> signal.values[5]
     1.0
     """
     structure = ffi.new(f"{kind} *")

@@ -23,6 +23,13 @@ class NoackError(Exception):
     """An error that is reported without a traceback, in one line for each mistake.
 
     Quoted input may contain any character: unprintable characters are escaped.
+
+    >>> import noack
+    >>> try:
+    ...     noack.load("lane_following", {"trigger.beta": -1.0})
+    ... except noack.NoackError as error:
+    ...     print(error)
+    settings: trigger.beta = -1.0: expected more than 0
     """
 
     exit_status = ExitStatus.FAILED

@@ -14,7 +14,7 @@ from functools import cache
 from typing import Any, Self
 
 import numpy as np
-from pydantic import GetJsonSchemaHandler, ValidationError, create_model, model_validator
+from pydantic import ConfigDict, GetJsonSchemaHandler, ValidationError, create_model, model_validator
 from pydantic_core import CoreSchema
 
 from noack.core.random_streams import named_stream_keys
@@ -26,7 +26,17 @@ from noack.settings.section import ReadTable, ScenarioSection, Table
 
 
 class Scenario(ScenarioTables):
-    """A run of the loop, completely described."""
+    """A run of the loop, completely described: the tables and keys of ``docs/scenarios.md``.
+
+    Matrices are tuples of rows; times are in seconds, those of ``timing`` in nanoseconds.
+
+    >>> import noack
+    >>> scenario = noack.load("lane_following")
+    >>> scenario.trigger.beta, scenario.network.mansd, scenario.timing.plant_period_ns
+    (0.5, 4, 2000000)
+    """
+
+    model_config = ConfigDict(json_schema_extra={"description": "A run of the loop, completely described."})
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -18,7 +18,15 @@ _SOURCE, _PERIOD_S = "noack", 1.0
 class RunObserver:
     """Follows a live run. A subclass overrides what it wants to be told; each method must return at once.
 
-    An observer that raises an exception is told no more, and the run goes on.
+    An observer that raises an exception is told no more, and the run goes on. Give it to
+    :func:`noack.run` by ``observers``.
+
+    >>> import noack
+    >>> class Printer(noack.RunObserver):
+    ...     def started(self, run_dir):
+    ...         print("the loop runs;", run_dir)
+    >>> Printer().started("runs/one")
+    the loop runs; runs/one
     """
 
     def waiting(self, roles: Sequence[str]) -> None:

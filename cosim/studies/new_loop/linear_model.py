@@ -309,7 +309,12 @@ def gain(
 ) -> LoopGain:
     """Compute the gain K of u = K x: a linear-quadratic regulator, or given eigenvalues.
 
-    For a scenario with a linear plant it is that of Â and B̂, which sensor and controller know.
+    For a scenario with a linear plant it is that of Â and B̂, which sensor and controller know. With n
+    states and m inputs, K is (m, n).
+
+    >>> import noack
+    >>> noack.gain("double_integrator").K.round(3).tolist()
+    [[-1.0, -1.732]]
 
     Args:
         plant: a linear model, or a plant as for :func:`linearise`.

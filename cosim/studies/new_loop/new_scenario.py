@@ -170,6 +170,11 @@ def new(
 ) -> NewScenario:
     """Choose a complete scenario for a plant; its ``save`` writes the file.
 
+    >>> import noack
+    >>> chosen = noack.new(noack.gain("double_integrator"), settings={"network.mansd": 1})
+    >>> chosen.scenario.network.mansd, chosen.scenario.trigger.policy
+    (1, 'decaying')
+
     Args:
         plant: a gain with its model; a model or a plant, for which K is chosen; or the file of one.
         path: the file that the scenario will have; file names in it are relative to its folder.
