@@ -113,13 +113,24 @@ def _exception(proof: Proof) -> str:
 
 
 def smallest_bounds(proof: Proof) -> list[Bound]:
-    """Return the bounds of a proof; of two bounds of the same output the smaller one."""
+    """Return the bounds of a proof; of two bounds of the same output the smaller one.
+
+    Left out is a limit that is not below what the bound from the start on tends to.
+    """
     smallest: dict[tuple[str, bool], Bound] = {}
     for bound in proof.bounds:
         key = (bound.output, bound.from_start)
         if key not in smallest or size(bound, proof.rate) < size(smallest[key], proof.rate):
             smallest[key] = bound
-    return list(smallest.values())
+    return [
+        bound
+        for (output, from_start), bound in smallest.items()
+        if from_start or not _limit_is_implied(bound, smallest.get((output, True)), proof.rate)
+    ]
+
+
+def _limit_is_implied(limit: Bound, bound: Bound | None, rate: arb) -> bool:
+    return bound is not None and bool(rate > 0 and bound.constant <= limit.constant)
 
 
 def size(bound: Bound, rate: arb) -> float:

@@ -18,6 +18,7 @@ from noack_check.check import RejectedError
 from noack_check.loop import Loop, Times
 from noack_check.proof import Proof, prove
 from noack_check.responses import Decay, responses, responses_until
+from noack_check.sentences import smallest_bounds
 from tests.checker.random_loops import (
     random_loop,
     random_loop_with_long_delays,
@@ -114,6 +115,13 @@ def test_a_constant_disturbance_has_the_limit_of_the_closed_form() -> None:
     loop = scalar(floor=0.01)._replace(pushes=identity(1), sizes=(number(0.05),))
     limits = sizes(by_gains(loop)[1], from_start=False)
     assert limits["x"] == pytest.approx(0.05 + 2 * 0.03, rel=_ACCURACY)
+
+
+def test_a_limit_that_the_bound_from_the_start_on_implies_is_not_stated() -> None:
+    proof = by_gains(scalar(floor=0.01))[1]
+    assert {bound.output for bound in proof.bounds if not bound.from_start} == {"x", "x[0]", "y[0]"}
+    assert all(bound.from_start for bound in smallest_bounds(proof))
+    assert len(smallest_bounds(proof)) == len(OUTPUTS)
 
 
 def test_any_number_of_later_events_is_covered() -> None:

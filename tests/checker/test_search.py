@@ -96,6 +96,12 @@ def test_a_rate_of_a_similar_loop_with_which_nothing_is_found_is_left() -> None:
         assert bounds_of(find_witness(loop, (), near=[near])) == bounds_of(alone)
 
 
+def test_a_similar_loop_with_bounds_by_gains_only_is_of_no_help() -> None:
+    loop = double_integrator()
+    near = {"rate": 0.1, "gains": {}}
+    assert bounds_of(find_witness(loop, (), near=[near])) == bounds_of(find_witness(loop, ()))
+
+
 def test_progress_rises_to_its_end() -> None:
     shares: list[float] = []
     find_witness(double_integrator(), progress=shares.append)

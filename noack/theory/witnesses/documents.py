@@ -89,7 +89,7 @@ def find_witness(
     Raises:
         NoWitnessError: none was found.
     """
-    wanted = _Wanted(outputs, ultimate, near)
+    wanted = _Wanted(outputs, ultimate, [document for document in near if "bounds" in document])
     try:
         return _by_forms(loop, wanted, Effort(progress, most_work))
     except NoWitnessError as error:

@@ -2,15 +2,16 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
-from noack.theory.witnesses.documents import Witness, find_witness
+from noack.theory.witnesses.documents import Witness, find_witness, witness_by_gains
 from noack.theory.witnesses.effort import NoWitnessError
+from noack_check.loop import Loop
 from noack_check.scenario import read_loop
 from tests.helpers.shipped import resolved
 
@@ -106,6 +107,23 @@ def test_a_search_that_found_nothing_is_not_repeated_unless_it_may_be_longer(
     assert searches == [0.2]
     assert found().proof is not None
     assert len(searches) == 2
+
+
+def test_bounds_by_gains_alone_are_searched_again_if_the_search_may_be_longer(
+    folder: Path, witness: Witness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = list[float]()
+
+    def search(loop: Loop, outputs: Sequence[str], *, most_work: float, **options: Any) -> Witness:
+        made.append(most_work)
+        return witness if most_work > 1 else witness_by_gains(loop, outputs)
+
+    monkeypatch.setattr("cosim.analysis.witnesses.find_witness", search)
+    for most_work, is_by_gains in ((0.0, True), (0.2, True), (0.1, True), (20.0, False), (0.0, False)):
+        document = found(most_work=most_work).document
+        assert document is not None
+        assert ("bounds" not in document) == is_by_gains
+    assert made == [0.2, 20.0]
 
 
 def test_a_folder_that_cannot_be_written_costs_nothing_but_time(
