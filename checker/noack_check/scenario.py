@@ -145,7 +145,9 @@ def _about_reference(loop: Loop, resolved: Table) -> Loop:
     columns = [(size * columns_of(loop.B, [j])).entries() for j, size in enumerate(about.input)]
     columns += [(size * columns_of(identity(n), [i])).entries() for i, size in enumerate(about.state)]
     columns = [kept for column in columns for kept in _nonzero(column)]
-    before = about.before_input + (loop.push_before_input or zeros(n, 1))
+    before = about.before_input
+    if loop.push_before_input is not None:
+        before += loop.push_before_input
     added = arb_mat(n, len(columns), [column[i] for i in range(n) for column in columns])
     return loop._replace(
         start=loop.start - about.start,

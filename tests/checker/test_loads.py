@@ -57,6 +57,16 @@ def test_the_rest_of_a_load_that_the_input_cannot_cancel_is_the_start_of_the_coo
     assert floats(loop.start)[:, 0] == pytest.approx([1.0, 0.0, 0.3, 0.0])
 
 
+def test_a_loop_with_a_reference_is_read_about_its_rest_and_the_reference() -> None:
+    step = '{kind="step",output="shaft_angle",value=0.5,from_s=0.0}'
+    loop = read_loop(motor(f"controller.reference=[{step}]"), box=False, ideal=False)
+    assert loop.fault() == ""
+    assert floats(loop.start)[:, 0] == pytest.approx([0.5, 0.0, 0.0])
+    assert loop.push_before_input is not None  # the motor rests at 0.5 rad without a voltage
+    assert floats(loop.push_before_input)[:, 0] == pytest.approx([0.0, 309.75 * 0.2, 0.0])
+    assert loop.until == 4  # the run ends
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
