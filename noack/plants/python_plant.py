@@ -5,8 +5,10 @@ but not the run.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
+from types import SimpleNamespace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -143,15 +145,52 @@ class PythonSystem:
 
         def derivative(t_s: float, z: Vector, u: Vector) -> Vector:
             with self._user_code():
-                rates = plant.derivative(t_s, read_only(z), read_only(u))
                 if z.dtype == object:  # enclosed numbers
-                    return np.asarray(rates)
+                    with _numpy_for_math(plant.derivative):
+                        return np.asarray(plant.derivative(t_s, read_only(z), read_only(u)))
+                rates = plant.derivative(t_s, read_only(z), read_only(u))
                 return real_vector("derivative(t_s, z, u)", rates, len(z0))
 
         derivative(0.0, z0, np.zeros(m))  # report its errors before the run
         output = plant.output if hasattr(plant, "output") else np.copy
         equations = PlantEquations(derivative, lambda _: z0, output=output, is_recorded=bool(self._recorded))
         return OdeSystem(equations, x0)
+
+
+_OTHER_NAMES = {
+    "asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2", "asinh": "arcsinh",
+    "acosh": "arccosh", "atanh": "arctanh", "pow": "float_power",
+}  # fmt: skip
+"""Functions of ``math`` that numpy has under another name."""
+_NUMPY_OF_MATH = {
+    name: getattr(np, _OTHER_NAMES.get(name, name))
+    for name in dir(math)
+    if hasattr(np, _OTHER_NAMES.get(name, name)) and not name.startswith("_") and name != "remainder"
+}
+
+
+@contextmanager
+def _numpy_for_math(derivative: UserCode) -> Iterator[None]:
+    """Let a user's function find numpy's functions where it uses those of ``math``.
+
+    Those of ``math`` make a float of their argument, so they cannot be enclosed. What the function's
+    module has of ``math`` is replaced while the equations are enclosed, and only then.
+    """
+    names = getattr(getattr(derivative, "__func__", derivative), "__globals__", {})
+    functions = {getattr(math, name): function for name, function in _NUMPY_OF_MATH.items()
+                 if callable(function)}  # fmt: skip
+    replaced = dict[str, UserCode]()
+    for name, value in names.items():
+        if value is math:
+            replaced[name] = SimpleNamespace(**{**vars(math), **_NUMPY_OF_MATH})
+        elif type(value) is type(math.sin) and value in functions:
+            replaced[name] = functions[value]
+    kept = {name: names[name] for name in replaced}
+    names.update(replaced)
+    try:
+        yield
+    finally:
+        names.update(kept)
 
 
 class _Stepping:

@@ -35,6 +35,8 @@ _DRIFT_ROUNDING = 1e-6
 _ROUGH_SHARE = 0.5
 """A plant is not smooth if its error in a tenth of a neighbourhood is more than this share of that in all
 of it; a tenth is expected."""
+_USUAL = 0.1
+"""A usual deviation from a point, relative to the component or 1."""
 _SMALL_ERROR = 1e-3
 """An error below this may be rounding."""
 _IMAGINARY_ROUNDING = 1e-7
@@ -266,36 +268,60 @@ def linearise(
     sizes = (None if at is None else len(at), None if input is None else len(input))
     reference = plant_reference(plant, settings, sizes)
     x, u = parse_vector("at", at, reference.n, "states"), parse_vector("input", input, reference.m, "inputs")
-    point = {"x0": x, "u0": u, "step_ns": reference.step_ns}
-    widths = () if reference.matrices else (within, within / 10)
-
-    def model_of(motion: LinearMotion, source: Source) -> LinearModel:
-        if motion.void is not None:
-            raise CallerError(f"{plant}: no linear model: {motion.void}")
-        errors = []
-        for width in widths:
-            halfwidths = np.full(reference.n + reference.m, width)
-            of_states = largest_errors(reference.system_at, motion, halfwidths, **point)  # type: ignore[arg-type]
-            errors.append(SampledError(width, of_states))
-        return LinearModel(reference, motion.A, motion.B, x, u, motion.drift, source, tuple(errors))
-
-    def moved(*, beside_steps: bool) -> LinearModel:
-        motion = linear_motion(
-            reference.system_at,
-            reference.n,
-            reference.m,
-            beside_steps=beside_steps,
-            **point,  # type: ignore[arg-type]
-        )
-        return model_of(motion, "beside" if beside_steps else motion.source)
-
+    point = _Point(reference, x, u, within)
     with np.errstate(all="ignore"):
         if (exact := reference.matrices or reference.system.linearisation()) is not None:
-            return model_of(LinearMotion(*exact, exact[0] @ x + exact[1] @ u, "motion"), "exact")
-        model = moved(beside_steps=False)
+            return point.model(LinearMotion(*exact, exact[0] @ x + exact[1] @ u, "motion"), "exact")
+        model = point.moved()
         if not model.is_rough or model.source != "derivative":
             return model
-        return min(model, moved(beside_steps=True), key=lambda each: each.largest_error)
+        usual = _USUAL * np.maximum(1.0, np.abs(np.concatenate([x, u])))
+        return min(model, point.moved(usual), key=lambda each: each.largest_error)
+
+
+class _Point(NamedTuple):
+    """A point of a plant, about which its models are."""
+
+    plant: PlantReference
+    x: Vector
+    u: Vector
+    within: float
+
+    def moved(self, beside: Vector | None = None) -> LinearModel:
+        """Return the model by the plant's derivative or motion; see :func:`linear_motion`."""
+        plant = self.plant
+        motion = linear_motion(
+            plant.system_at, plant.n, plant.m, x0=self.x, u0=self.u, step_ns=plant.step_ns, beside=beside
+        )
+        return self.model(motion, motion.source if beside is None else "beside")
+
+    def model(self, motion: LinearMotion, source: Source) -> LinearModel:
+        """Return a model with its sampled errors; raise CallerError if there is none."""
+        plant, errors = self.plant, []
+        if motion.void is not None:
+            raise CallerError(f"{plant.label}: no linear model: {motion.void}")
+        for width in () if plant.matrices else (self.within, self.within / 10):
+            halfwidths = np.full(plant.n + plant.m, width)
+            of_states = largest_errors(
+                plant.system_at, motion, halfwidths, x0=self.x, u0=self.u, step_ns=plant.step_ns
+            )
+            errors.append(SampledError(width, of_states))
+        return LinearModel(plant, motion.A, motion.B, self.x, self.u, motion.drift, source, tuple(errors))
+
+
+def beside_steps(model: LinearModel, sizes: Vector) -> LinearModel:
+    """Return the model of a plant beside the steps of its derivative, as of friction; else the same.
+
+    Args:
+        model: at a point.
+        sizes: usual deviations of x and u from it, (n + m,).
+    """
+    if model.source not in ("derivative", "beside"):
+        return model
+    with np.errstate(all="ignore"):
+        found = _Point(model.plant, model.at, model.input, model.errors[0].within).moved(sizes)
+    is_same = np.array_equal(found.A, model.A) and np.array_equal(found.B, model.B)
+    return model if is_same or not np.isfinite(found.A).all() else found
 
 
 def gain(

@@ -33,14 +33,16 @@ from cosim.studies.new_loop import (
 from cosim.studies.new_loop.linear_model import (
     LinearModel,
     LoopGain,
+    beside_steps,
     eigenvalue_text,
     gain,
     model_or_gain,
     parse_vector,
 )
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
-from noack.core.linear_systems import Matrix, Vector, norm
+from noack.core.linear_systems import Matrix, Vector, discretise, norm
 from noack.core.number_checks import real_number
 from noack.core.number_format import at_most, to_digits
 from noack.plants.linear import LinearSettings
@@ -58,8 +60,6 @@ from noack.trigger_policies.decaying import DecayingSettings
 
 _FLOOR_SHARE = 0.05
 """The floor of the threshold, as a share of beta."""
-_LARGEST_FLOOR_SHARE = 0.5
-"""The largest floor that is tried for the allowed errors, as a share of beta."""
 _FASTEST_ALPHA_PER_S = 1.0
 """α is at most this, unless allowed errors ask for a fast loop."""
 _RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0, 250.0, 500.0)
@@ -72,14 +72,23 @@ _OTHER_WEIGHT = 0.01
 """Weight of a state without an allowed error in the regulator, where others have one, with weight 1."""
 _INPUT_WEIGHTS = (1.0, 10.0, 100.0)
 """r of the regulators that are tried: with a larger one the gain is slower."""
-_FRICTION_INPUT_WEIGHTS = (0.01, 0.1, 1.0)
-"""The same with allowed errors, if friction keeps an output off by its size over the gain."""
+_FRICTION_INPUT_WEIGHTS = (1.0, 0.1, 0.01, 0.001, 1e-4)
+"""The same with allowed errors and friction, which keeps an output off by its size over the gain."""
+_STICKING_SHARE = 0.2
+"""Of an allowed error, friction takes at most this, if a gain is stiff enough."""
+_SIZE_STEPS, _SIZE_TIME_CONSTANTS, _LEAST_SIZE = 400, 5.0, 1e-3
+"""How long and how finely the linear loop is followed to see how large its states become; the least size
+of one, as a share of the largest."""
 _LOOSE_BOUND_RATIO = 200.0
 """A bound of ‖x‖ above this multiple of ‖x(0)‖ is used only if there is no other."""
 _DEFAULT_START = 0.1
 """x(0) of a state, if the plant has none."""
 _MOST_THRESHOLDS = 3
 """Last thresholds that are tried for the allowed errors."""
+_FRICTION_FLOOR_SHARE = 0.15
+"""The first last threshold of a plant with friction, as a share of the first allowed error."""
+_SLOWER, _MOST_RATES = 0.5, 3
+"""Factor of α if nothing is proven with it, and how many are tried."""
 _LEAST_USE, _MOST_USE = 0.6, 0.85
 """Shares of an allowed error that its bound has in the end: at least, and wanted."""
 _MOST_OUTPUTS = 4
@@ -154,6 +163,8 @@ class _Trial:
     alpha_per_s: float
     x0: Vector
     weight: Matrix | None = None
+    has_friction: bool = False
+    """Whether friction keeps the plant from x = 0: then a search takes the longest."""
     floor: float | None = None
     """Last threshold; None: a share of the first one."""
 
@@ -197,8 +208,12 @@ def new(
     model = plant_model.model if isinstance(plant_model, LoopGain) else plant_model
     _require_rest(model)
     errors = _allowed(model, allowed)
+    x0 = _initial_state(model, fixed_state)
+    if plant_model is model:
+        first = gain(model, q=_state_weights(model, errors))
+        plant_model = model = beside_steps(model, _sizes(first, x0))
     trials = _TrialScenarios(model, Path(path), fixed, errors)
-    best = trials.search([*_list_trials(plant_model, _initial_state(model, fixed_state), errors)], report)
+    best = trials.search([*_list_trials(plant_model, x0, errors)], report)
     report("simulating")
     returns = trials.returns(best)
     for _ in range(_MOST_REDUCTIONS):
@@ -253,20 +268,6 @@ def _require_rest(model: LinearModel) -> None:
         )
 
 
-def _next_floor(floor: float, share: float, largest: float) -> float:
-    """Return the floor to try next, or the same again.
-
-    Args:
-        floor: the last one.
-        share: the largest share of an allowed error that its bound has in the end; infinite without a bound.
-        largest: the largest floor.
-    """
-    if _LEAST_USE <= share <= 1.0:
-        return floor
-    factor = _MOST_USE / share if math.isfinite(share) else _FLOOR_SHARE
-    return min(to_digits(floor * factor, 2), largest)
-
-
 def _initial_state(model: LinearModel, fixed_state: object) -> Vector:
     """Return x(0): as given, the plant's own, or 0.1 for each state that is no other's rate."""
     n, unit = model.plant.n, np.eye(model.plant.n)
@@ -284,10 +285,15 @@ def _list_trials(
 ) -> Iterator[_Trial]:
     """Yield what is tried, the preferred settings first; states without an allowed error may move."""
     linear = model.model if isinstance(model, LoopGain) else model
-    plant, has_friction = linear.plant, linear.source == "beside"
-    input_weights = _FRICTION_INPUT_WEIGHTS if allowed and has_friction else _INPUT_WEIGHTS
-    q = [1.0 if name in allowed else _OTHER_WEIGHT for name in plant.state_names] if allowed else None
-    gains = [model] if isinstance(model, LoopGain) else [gain(model, q=q, r=r) for r in input_weights]
+    has_friction = linear.source == "beside"
+    if isinstance(model, LoopGain):
+        gains = [model]
+    else:
+        q = _state_weights(model, allowed)
+        input_weights = _FRICTION_INPUT_WEIGHTS if allowed and has_friction else _INPUT_WEIGHTS
+        gains = [gain(model, q=q, r=r) for r in input_weights]
+        if allowed and has_friction:
+            gains = [each for each in gains if _sticks_within(each, x0, allowed)] or gains[-1:]
     for loop_gain in gains:
         fastest = max(
             (size for size in np.abs(loop_gain.eigenvalues) if size < _FASTEST_EIGENVALUE_PER_S), default=1
@@ -298,11 +304,59 @@ def _list_trials(
         is_fixed = loop_gain.model.plant.system.has_own_step
         for rate_hz in (usual_hz,) if is_fixed else (usual_hz, 2 * usual_hz):
             for mansd in range(DEFAULT_MANSD, 0, -1):
-                for share in (ALPHA_SHARE, ALPHA_SHARE / 2):
-                    is_fast = allowed and not has_friction  # friction does not decay
-                    fastest_per_s = math.inf if is_fast else _FASTEST_ALPHA_PER_S
+                for share in (ALPHA_SHARE / 2,) if has_friction else (ALPHA_SHARE, ALPHA_SHARE / 2):
+                    fastest_per_s = math.inf if allowed else _FASTEST_ALPHA_PER_S
                     alpha = to_digits(min(share * loop_gain.decay_per_s, fastest_per_s))
-                    yield _Trial(loop_gain, rate_hz, mansd, alpha, x0)
+                    weight = _unit_weight(loop_gain, x0, allowed)
+                    yield _Trial(loop_gain, rate_hz, mansd, alpha, x0, weight, has_friction)
+
+
+def _state_weights(model: LinearModel, allowed: Mapping[str, float]) -> list[float] | None:
+    """Return the weights of the states in the regulator; None: all are 1."""
+    names = model.plant.state_names
+    return [1.0 if name in allowed else _OTHER_WEIGHT for name in names] if allowed else None
+
+
+def _sizes(loop: LoopGain, x0: Vector) -> Vector:
+    """Return how large states and inputs become in the linear loop from x(0), (n + m,)."""
+    A, B = loop.model.A, loop.model.B
+    step_ns = round(_SIZE_TIME_CONSTANTS / loop.decay_per_s / _SIZE_STEPS * NS_PER_S)
+    step, _ = discretise(A + B @ loop.K, np.zeros_like(B), max(step_ns, 1))
+    x, largest = x0 if x0.any() else np.full(len(x0), _DEFAULT_START), np.zeros(len(A) + B.shape[1])
+    for _ in range(_SIZE_STEPS):
+        largest = np.maximum(largest, np.abs(np.concatenate([x, loop.K @ x])))
+        x = step @ x
+    return np.maximum(largest, _LEAST_SIZE * largest.max())
+
+
+def _sticks_within(loop: LoopGain, x0: Vector, allowed: Mapping[str, float]) -> bool:
+    """Return whether friction keeps each allowed state off by a small share of its allowed error.
+
+    Where the model is beside a step of a plant's derivative, the rest of the derivative is v, the same near
+    and far. Against it the loop rests at (A + BK)⁻¹ v.
+    """
+    model, sizes = loop.model, _sizes(loop, x0)[: len(x0)]
+    rates = getattr(model.plant.system_at(np.zeros_like(x0)), "rates", None)
+    assert rates is not None  # a model beside a step is one of a derivative
+    left_out, u = np.zeros_like(x0), np.zeros(model.B.shape[1])
+    for size, x in zip(sizes, np.eye(len(x0)), strict=True):
+        rests = [np.abs(rates(share * size * x, u) - model.A @ (share * size * x)) for share in (0.5, 1.0)]
+        left_out += np.minimum(*rests)
+    off = np.abs(np.linalg.inv(model.A + model.B @ loop.K)) @ left_out
+    names = model.plant.state_names
+    return all(off[names.index(name)] <= _STICKING_SHARE * error for name, error in allowed.items())
+
+
+def _unit_weight(loop: LoopGain, x0: Vector, allowed: Mapping[str, float]) -> Matrix | None:
+    """Return W of the trigger's norm, in units of the first allowed state; None without one.
+
+    Errors of different units count by how large their states become.
+    """
+    if not allowed:
+        return None
+    sizes, names = _sizes(loop, x0)[: len(x0)], loop.model.plant.state_names
+    first = sizes[names.index(next(iter(allowed)))]
+    return np.diag([to_digits(first / size, 2) for size in sizes])
 
 
 class _TrialScenarios:
@@ -348,7 +402,7 @@ class _TrialScenarios:
                 "policy": "decaying",
                 "beta": beta,
                 "alpha_per_s": alpha,
-                "floor": to_digits(_FLOOR_SHARE * beta) if trial.floor is None else trial.floor,
+                "floor": self._first_floor(trial, beta) if trial.floor is None else trial.floor,
                 **({"weight": weight} if weight else {}),
             },
             "network": {
@@ -361,6 +415,13 @@ class _TrialScenarios:
         for key, value in self._fixed_settings.items():
             put(content, key, value, f"--set {key}")
         return content
+
+    def _first_floor(self, trial: _Trial, beta: float) -> float:
+        """Return the last threshold that is tried first."""
+        floor = _FLOOR_SHARE * beta
+        if trial.has_friction and self._allowed:
+            floor = min(_FRICTION_FLOOR_SHARE * next(iter(self._allowed.values())), beta / 2)
+        return to_digits(floor, 3)
 
     def _outputs(self) -> list[Table]:
         """Return the outputs: the states with an allowed error, or those whose units are known."""
@@ -376,29 +437,54 @@ class _TrialScenarios:
     def with_threshold(self, trial: _Trial, report: Callable[[str], None]) -> tuple[_Trial, Certificates]:
         """Return the trial with the last threshold that the allowed errors need, and its certificates.
 
-        A bound that does not decay is proportional to this threshold, where nothing disturbs the plant; of
-        plants that are not linear, friction may be most of it, so the largest threshold is the first.
+        A bound that does not decay is proportional to this threshold, where nothing disturbs the plant.
         """
         is_fixed = not self._fixed_settings.keys().isdisjoint(("trigger", "trigger.floor"))
-        used = self.scenario(trial).trigger
-        largest = None  # of the floors
-        if self._allowed and not is_fixed and isinstance(used, DecayingSettings):
-            largest = to_digits(_LARGEST_FLOOR_SHARE * used.beta, 2)
-            trial = replace(trial, floor=used.floor if self.is_linear else largest)
-        near: list[Mapping[str, object]] = []
+        trial, results = self._with_proof(trial, report)
         for number in range(_MOST_THRESHOLDS):
-            report(f"searching for proofs{f': threshold {number + 1}' if number else ''}")
-            results = certificates_of(self.scenario(trial), of_model=True)
-            most_work = 2 * RUN_WORK if self.is_linear else MOST_WORK
-            found = results.prove(most_work=most_work, conditions=("schedule",), near=near)
-            near = [each.document for each in found.statements if each.document is not None]
-            if largest is None or number == _MOST_THRESHOLDS - 1:
+            if number:
+                report(f"searching for proofs: threshold {number + 1}")
+                results = self._proven(trial)
+            used = results.scenario.trigger
+            if not self._is_proven(results) or is_fixed or not isinstance(used, DecayingSettings):
                 break
-            wanted = _next_floor(trial.floor or largest, self.largest_share(results), largest)
-            if wanted == trial.floor:
+            largest = self.largest_share(results)
+            is_enough = largest <= 1.0 and (largest >= _LEAST_USE or trial.has_friction)
+            if is_enough or number == _MOST_THRESHOLDS - 1:
+                break
+            wanted = to_digits(min(used.floor * _MOST_USE / largest, used.beta / 2), 2)
+            if wanted == used.floor:
                 break
             trial = replace(trial, floor=wanted)
         return trial, results
+
+    def _with_proof(self, trial: _Trial, report: Callable[[str], None]) -> tuple[_Trial, Certificates]:
+        """Return the trial with a decay of the threshold for which bounds are proven, else the first."""
+        report("searching for proofs")
+        first = trial, self._proven(trial)
+        if self._is_proven(first[1]) or not self._allowed or "trigger" in self._fixed_settings:
+            return first
+        for number in range(1, _MOST_RATES if "trigger.alpha_per_s" not in self._fixed_settings else 1):
+            report(f"searching for proofs: a slower threshold, {number + 1} of {_MOST_RATES}")
+            trial = replace(trial, alpha_per_s=to_digits(_SLOWER * trial.alpha_per_s))
+            if self._is_proven(results := self._proven(trial)):
+                return trial, results
+        return first
+
+    @staticmethod
+    def _is_proven(results: Certificates) -> bool:
+        """Return whether each output with an allowed error has a bound that is proven."""
+        if results.guaranteed is None:
+            return False
+        bounds = results.output_bounds(results.guaranteed)
+        return all(bound.is_proven for bound in bounds if bound.output.allowed)
+
+    def _proven(self, trial: _Trial) -> Certificates:
+        """Return the certificates of a trial, with the bounds that are proven."""
+        results = certificates_of(self.scenario(trial), of_model=True)
+        most_work = 2 * RUN_WORK if self.is_linear else MOST_WORK
+        results.prove(most_work=most_work, conditions=("schedule",))
+        return results
 
     @staticmethod
     def largest_share(results: Certificates) -> float:

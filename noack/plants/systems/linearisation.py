@@ -32,6 +32,8 @@ _WIDEST, _FINER, _STEPS = 0.1, 4.0, 10
 """Steps of a difference: the widest, relative to the component or 1; the ratio of two; the number."""
 _NOISE = 100.0
 """An entry that is smaller than this multiple of its change from step to step is 0."""
+_STEP_SHARE, _STEADY_SHARE = 0.2, 0.2
+"""At a step the slope changes by at least this share of it, and beside it by at most this share of that."""
 _ROUNDING = 1e-13
 """Relative rounding error of what the system computes."""
 _DIGITS = 10
@@ -67,7 +69,7 @@ def linearise(
     x0: Vector | None = None,
     u0: Vector | None = None,
     step_ns: int = STEP_NS,
-    beside_steps: bool = False,
+    beside: Vector | None = None,
 ) -> LinearMotion:
     """Linearise a system.
 
@@ -78,8 +80,8 @@ def linearise(
         x0: x₀, (n,); by default 0.
         u0: u₀, (m,); by default 0.
         step_ns: step of a system that is moved.
-        beside_steps: where the derivative has a steep step at the point, as smoothed dry friction does,
-            take the slope beside it.
+        beside: deviations of x and u that are usual, (n + m,): where the derivative has a step at the
+            point that is steep for these, as smoothed dry friction has, take the slope beside it.
     """
     x0, u0 = np.zeros(n) if x0 is None else x0, np.zeros(m) if u0 is None else u0
     rates = getattr(system_at(x0), "rates", None)
@@ -90,14 +92,16 @@ def linearise(
         return np.asarray(rates(point[:n], point[n:]))
 
     point = np.concatenate([x0, u0])
-    jacobian, drift = _differences(f, point, beside_steps=beside_steps), f(point)
+    jacobian, drift = _differences(f, point), f(point)
+    if beside is not None:
+        jacobian = _beside_steps(f, point, jacobian, beside)
     void = None if np.isfinite(jacobian).all() and np.isfinite(drift).all() else NOT_FINITE
     if void is None and not np.array_equal(f(point), drift):
         void = NOT_REPEATED
     return LinearMotion(jacobian[:, :n], jacobian[:, n:], drift, "derivative", void)
 
 
-def _differences(f: Callable[[Vector], Vector], point: Vector, *, beside_steps: bool) -> Matrix:
+def _differences(f: Callable[[Vector], Vector], point: Vector) -> Matrix:
     """Return the Jacobian of f, (n, len(point)); NaN where f is not finite."""
     columns = []
     size = np.abs(f(point))
@@ -115,10 +119,28 @@ def _differences(f: Callable[[Vector], Vector], point: Vector, *, beside_steps: 
         if jumps.any():
             beside = _steadiest(np.diff(rises, axis=0) / np.diff(steps)[:, None], size)
             column = np.where(jumps, beside, column)
-        if beside_steps:
-            is_step = np.abs(rises[1]) > 0.5 * np.abs(rises[0])
-            column = np.where(is_step, _rounded((rises[0] - rises[1]) / (steps[0] - steps[1])), column)
         columns.append(column)
+    return np.array(columns).T
+
+
+def _beside_steps(f: Callable[[Vector], Vector], point: Vector, jacobian: Matrix, widths: Vector) -> Matrix:
+    """Return the Jacobian with the slopes beside steps at the point; ``widths`` are usual deviations.
+
+    There is a step if the slopes from a quarter to a half and from a half to all of the width agree, and
+    the slope at the point is another one.
+    """
+    columns = []
+    for i, width in enumerate(widths):
+        off = np.zeros_like(point)
+        rises = []
+        for share in (1.0, 0.5, 0.25):
+            off[i] = share * width
+            rises.append((f(point + off) - f(point - off)) / 2)
+        far, near = (rises[0] - rises[1]) / (0.5 * width), (rises[1] - rises[2]) / (0.25 * width)
+        change = np.abs(jacobian[:, i] - near)
+        is_other = change > _STEP_SHARE * np.abs(jacobian[:, i])
+        is_step = is_other & (np.abs(far - near) <= _STEADY_SHARE * change)
+        columns.append(np.where(is_step, _rounded(far), jacobian[:, i]))
     return np.array(columns).T
 
 

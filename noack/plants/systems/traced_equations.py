@@ -137,8 +137,10 @@ class TracedNumber:
         return not self == 0  # noqa: SIM201 # __ne__ would be another comparison
 
     def __float__(self) -> float:
-        """Refuse to become a float, as the functions of ``math`` ask."""
-        raise TypeError("a certificate on a region needs numpy's functions: np.sin, not math.sin")
+        """Refuse to become a float: nothing would be known about it on a region."""
+        raise TypeError(
+            "its equations make a float of a state; use the states as they are, and functions of numpy"
+        )
 
     def __getattr__(self, name: str) -> Callable[..., "TracedNumber"]:
         """Return a function of numpy, or refuse it by its name."""
@@ -164,6 +166,10 @@ class TracedNumber:
     def negative(self) -> "TracedNumber":
         """See :func:`numpy.negative`."""
         return -self
+
+    def copysign(self, other: Operand) -> "TracedNumber":
+        """See :func:`numpy.copysign`."""
+        return abs(self) * self._trace.traced(other).sign()
 
     def maximum(self, other: Operand) -> "TracedNumber":
         """See :func:`numpy.maximum`."""
