@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cosim.output.figures import palette
 from cosim.output.figures.palette import CONTROLLER, LOST, PLANT, SENSOR, THRESHOLD, Colour
 from noack.core.linear_systems import Matrix, Vector
+from noack.scenario.outputs import DISTANCE, LoopOutput
 
 Dash = tuple[float, ...]
 """Lengths of strokes and gaps, in widths of the line; empty: a solid line."""
@@ -35,7 +36,8 @@ _BOUND_STYLES: dict[BoundKind, tuple[Colour, tuple[Dash, ...]]] = {
     "identity": (palette.IDENTITY, ((1.2, 1.4),)),
     "printed": (palette.PRINTED, ((6, 1.5, 1, 1.5, 1, 1.5),)),
 }
-Quantity = Literal["e_c", "x", "inter_event"]
+Quantity = str
+"""What is bounded: "e_c", "x", "inter_event", or an output, as its panel is called."""
 _PANELS: dict[Quantity, str] = {"e_c": ERRORS, "x": STATE_NORM, "inter_event": INTERVALS}
 
 
@@ -85,7 +87,7 @@ class Curve:
     @property
     def is_logarithmic(self) -> bool:
         """Whether the curve needs a logarithmic axis: norms, which fall over decades."""
-        return self.panel in (ERRORS, STATE_NORM)
+        return self.panel in (ERRORS, STATE_NORM) or self.panel.startswith(DISTANCE)
 
 
 def state_curves(
@@ -114,6 +116,16 @@ def state_curves(
         for name, states, style in sources
         if states is not None
     ]
+
+
+def output_curves(output: LoopOutput, t_s: Vector, distance: Vector) -> list[Curve]:
+    """Return an output's distance from what it follows, (k,), and its allowed error."""
+    panel = output.distance
+    curves = [Curve(panel, output.name, output.unit, t_s, distance, CurveStyle(PLANT, 2.4))]
+    if output.allowed is not None and len(t_s):
+        ends_s, allowed = t_s[[0, -1]], np.full(2, output.allowed)
+        curves.append(Curve(panel, "allowed", output.unit, ends_s, allowed, CurveStyle(THRESHOLD, 1.8)))
+    return curves
 
 
 def error_curves(t_s: Vector, e_s: Vector, e_c: Vector, threshold: Vector | None) -> list[Curve]:
@@ -176,5 +188,5 @@ def bound_curves(bounds: Iterable[tuple[str, Quantity, Vector, Vector, BoundKind
         counts[quantity, kind] += 1
         unit = "s" if quantity == "inter_event" else ""
         style = CurveStyle(colour, 1.6, dash)
-        curves.append(Curve(_PANELS[quantity], label, unit, t_s, values, style))
+        curves.append(Curve(_PANELS.get(quantity, quantity), label, unit, t_s, values, style))
     return curves

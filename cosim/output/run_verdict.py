@@ -27,7 +27,7 @@ from noack.protocol.roles import RECORDER
 from noack.protocol.wire_format import Rejection
 from noack.runtime.end_reasons import HORIZON
 from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
-from noack.theory.certificates.assumptions import AssumptionStatus
+from noack.theory.certificates.assumptions import LINEAR_PLANT, AssumptionStatus
 
 _MOST_NAMED = 3
 """Largest number of claims of a verdict that are named."""
@@ -416,8 +416,10 @@ def _has_clocks(loop: LoopSummary) -> bool:
 
 
 def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
+    held = any(claim.is_certified and claim.verdict == "held" for claim in loop.claims)
     for part in loop.assumptions:
-        if part.verdict == AssumptionStatus.VIOLATED:
+        is_of_plant = part.what == LINEAR_PLANT  # a certificate of its equations does not need it
+        if part.verdict == AssumptionStatus.VIOLATED and not (is_of_plant and held):
             yield f"assumption violated: {part.what} ({part.source}): {part.why}"
     yield from loop.uneven_periods
     plant = loop.lateness_us.get("plant")

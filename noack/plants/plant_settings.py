@@ -33,10 +33,12 @@ _ESCAPE = 1e4
 """If a state grows by this factor within a step of the plant, it has diverged."""
 _GAVE_UP = {
     -2: f"the integrator needs more than {_MAX_STEPS:,} steps from one sample to the next",
-    -3: "the integrator's steps become too small; the equations jump there",
+    -3: "the integrator's steps become too small",
     -4: "they are too stiff for an explicit integrator",
 }
 """Status codes of dopri5, as text."""
+_JUMPING = "; if they jump, as with np.sign(v), write np.tanh(v / w) with a small w instead"
+"""What ends the most frequent reason: at rest, dry friction as a sign jumps at each step."""
 
 
 class SystemFailedError(NoackError):
@@ -309,7 +311,9 @@ class OdeSystem:
             escaped = not np.linalg.norm(z) < _ESCAPE * np.linalg.norm(self._state)
         if np.isfinite(slope).all() and not escaped:
             reason = _GAVE_UP.get(code, "the tolerance cannot be met")
-            raise SystemFailedError(f"the plant's equations cannot be integrated at {t_s:.6g} s: {reason}")
+            raise SystemFailedError(
+                f"the plant's equations cannot be integrated at {t_s:.6g} s: {reason}{_JUMPING}"
+            )
 
     def _guarded(self, t_s: float, z: Vector, v: Vector) -> Sequence[float] | Vector:
         """Return f, or NaN after an exception: an exception cannot stop the integrator."""

@@ -13,6 +13,8 @@ from noack.plants.plant_settings import name_and_unit
 from noack.settings.section import Positive, Row, ScenarioSection, require_length
 
 _LONGEST_NAME, _LONGEST_UNIT = 64, 24
+DISTANCE = "output "
+"""What the name of an output's distance begins with."""
 
 
 class OutputSection(ScenarioSection):
@@ -39,6 +41,11 @@ class LoopOutput(NamedTuple):
     """The factors of the n states."""
     allowed: float | None = None
     """The allowed error; None: nothing is asked."""
+
+    @property
+    def distance(self) -> str:
+        """The name of its distance |y − r| from what it follows, in bounds and curves."""
+        return f"{DISTANCE}{self.name}"
 
     def quantity(self, value: str) -> str:
         """Return a value with the output's unit."""

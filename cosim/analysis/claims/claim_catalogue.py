@@ -37,8 +37,9 @@ class Envelope(NamedTuple):
     """A curve that bounds a measured one."""
 
     label: str
-    quantity: Literal["e_c", "x", "inter_event"]
-    """``"e_c"`` for ‖e_c‖_W, ``"x"`` for ‖x‖, ``"inter_event"`` for a lower bound in seconds."""
+    quantity: str
+    """``"e_c"`` for ‖e_c‖_W, ``"x"`` for ‖x‖, ``"inter_event"`` for a lower bound in seconds, or an output's
+    :attr:`~noack.scenario.outputs.LoopOutput.distance`."""
     t_s: Reals
     values: Reals
     kind: Literal["certified", "identity", "printed"] = "certified"
@@ -427,7 +428,8 @@ def _output_claim(
             return ClaimBound(Bound(formula, t_s[later], shares, void, output.allowed))
         values, first = certificate.state(t_s), certificate.first("state")
         return ClaimBound(
-            Bound(output_bound.pattern, t_s, upper_shares(observed, values + slack), void, first)
+            Bound(output_bound.pattern, t_s, upper_shares(observed, values + slack), void, first),
+            Envelope(f"certified for {of_loop.scope}", output.distance, t_s, values),
         )
 
     return output_claim

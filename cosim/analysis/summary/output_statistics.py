@@ -21,7 +21,7 @@ def output_parts(record: RunRecord) -> list[OutputPart]:
 
 def _output_part(record: RunRecord, output: LoopOutput) -> OutputPart:
     largest, last, outside_s = 0.0, None, None
-    for t_s, distances in _distances(record, output):
+    for t_s, distances in output_distances(record, output):
         largest, last = float(np.maximum(largest, distances.max())), float(distances[-1])
         if output.allowed is not None and len(outside := np.flatnonzero(~(distances <= output.allowed))):
             outside_s = float(t_s[outside[-1]])
@@ -40,7 +40,7 @@ def _output_part(record: RunRecord, output: LoopOutput) -> OutputPart:
     )
 
 
-def _distances(
+def output_distances(
     record: RunRecord, output: LoopOutput
 ) -> Iterator[tuple["np.ndarray[tuple[int], np.dtype[np.float64]]", ...]]:
     """Yield times in s and |y − r|, (k,) each."""

@@ -6,7 +6,7 @@ controller; dashed curves are certified bounds.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import groupby
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.claim_evaluation import claims_of
+from cosim.analysis.summary.output_statistics import output_distances
 from cosim.output.curves import (
     DASHED,
     BoundKind,
@@ -25,6 +26,7 @@ from cosim.output.curves import (
     error_curves,
     input_curves,
     norm_curve,
+    output_curves,
     state_curves,
     transmission_curves,
 )
@@ -59,6 +61,7 @@ from noack.core.row_operations import row_norms
 from noack.guarantee.loss_guarantee import LossesInWindow
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, Fate
 from noack.protocol.wire_format import Flow
+from noack.scenario.outputs import LoopOutput
 from noack.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -69,11 +72,13 @@ Flags = NDArray[np.bool_]
 Envelope = tuple[str, Quantity, Reals, Reals, BoundKind]
 """A bound: label, bounded quantity, times in s (k,), values (k,), source."""
 
-BOUNDED = ("errors", "state-norm", "inter-event")
+BOUNDED = ("outputs", "errors", "state-norm", "inter-event")
 """The figures that show certified bounds."""
 _STATES_NARROWEST_IN, _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN = 1.7, 2.2, 5.0
 """Widths of a panel of these figures, in inches."""
 _MOST_STATES = 16
+_MOST_OUTPUTS, _LEAST_SHOWN = 6, 0.01
+"""Outputs that are drawn; the least distance, as a share of the allowed error."""
 _LONGEST_TITLE = 40  # characters
 _DECADES = 6
 """Maximum decades of an axis of norms."""
@@ -103,7 +108,12 @@ def run_figures(
     def bounds(quantity: Quantity) -> list[Curve]:
         return bound_curves(envelope for envelope in certified if envelope[1] == quantity)
 
-    figures = {
+    figures: dict[str, Callable[[], PageFigure]] = {}
+    if outputs := _stated_outputs(record):
+        figures["outputs"] = lambda: _outputs(
+            record, {output.name: bounds(output.distance) for output in outputs}
+        )
+    figures |= {
         "states": lambda: _states(record, aligned()),
         "errors": lambda: _errors(record.scenario, aligned().run, bounds("e_c")),
         "state-norm": lambda: _state_norm(record, bounds("x")),
@@ -127,6 +137,7 @@ def run_curves(record: RunRecord) -> list[Curve]:
     delivered = np.isin(events["event"], record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"])
     return [
         *_states_of(record, samples),
+        *(curve for output in _stated_outputs(record) for curve in _output_curves(record, output)),
         *_errors_of(samples.run),
         norm_curve(*_decimated(record, PLANT_STEP, "x", row_norms)),
         *input_curves(record.loop.input_names, *_decimated(record, CONTROLLER_STEP, "u")),
@@ -263,6 +274,7 @@ def _draw_intervals(figure: "Figure", t_s: Reals, transmissions: Transmissions) 
     highest = max(np.nanmax(np.append(finite(gaps), 0.0)) for gaps in (since_sent, since_received))
     for axes, title in ((sent, "Broadcasting intervals"), (received, "Receiving intervals")):
         axes.set(title=title, ylabel="interval [s]", ylim=(0.0, 1.05 * highest or None))
+        mark_empty(axes, "fewer than two packets")
         set_times(axes, t_s, labelled=axes is received)
     return [sent, received]
 
@@ -315,6 +327,59 @@ def _estimate_text(scenario: Scenario) -> str:
         return "x̂ is the measurement, x with noise. "
     outputs = scenario.message_sizes.outputs
     return f"x̂ is the estimate of the observer, from {outputs} {'output' if outputs == 1 else 'outputs'}. "
+
+
+# Outputs with their bounds and allowed errors
+
+
+def _stated_outputs(record: RunRecord) -> Sequence[LoopOutput]:
+    """Return the outputs that the scenario states."""
+    return record.scenario.loop_outputs() if record.scenario.outputs else ()
+
+
+def _output_curves(record: RunRecord, output: LoopOutput) -> list[Curve]:
+    """Return the distance of an output from what it follows, over the steps of the plant."""
+    parts = [*output_distances(record, output)] or [(np.zeros(0), np.zeros(0))]
+    kept = [decimate_all(t_s, values[:, None], record.slice_columns) for t_s, values in parts]
+    t_s, distance = (
+        np.concatenate([part[i][rows] for part, rows in zip(parts, kept, strict=True)]) for i in (0, 1)
+    )
+    return output_curves(output, t_s, distance)
+
+
+def _outputs(record: RunRecord, bounds: Mapping[str, list[Curve]]) -> PageFigure:
+    outputs = _stated_outputs(record)[:_MOST_OUTPUTS]
+    target = "set-point" if record.scenario.controller.reference is None else "reference"
+    drawn = {output: _output_curves(record, output) for output in outputs}
+
+    def draw(figure: "Figure") -> list[Panels]:
+        panels = []
+        for i, (output, curves) in enumerate(drawn.items()):
+            axes = figure.add_axes((0, 0, 1, 1))
+            title = f"{label_text(output.name)}: distance from its {target}"
+            draw_norms(axes, title, curves, bounds[output.name])
+            if output.allowed is not None:  # what is far within is of no interest
+                axes.set_ylim(bottom=max(axes.get_ylim()[0], _LEAST_SHOWN * output.allowed))
+            unit = f" [{label_text(output.unit)}]" if output.unit else ""
+            axes.set_ylabel(f"distance{unit}")
+            set_times(axes, curves[0].t_s, labelled=i == len(drawn) - 1)
+            panels.append(Panels([axes], 2.3))
+        return panels
+
+    asked = [output.name for output in outputs if output.allowed is not None]
+    allowed = f" Horizontal: the allowed error of {' and '.join(asked)}." if asked else ""
+    return PageFigure(
+        name="outputs",
+        draw_panels=draw,
+        caption=f"What the scenario asks of the loop: how far each output is from its {target}.{allowed}"
+        + _dashed([bound for each in bounds.values() for bound in each]),
+        description="Distances over time on a logarithmic axis: "
+        + ", ".join(
+            f"{output.name} up to {output.quantity(largest_text(curves[0].values))}"
+            for output, curves in drawn.items()
+        )
+        + ".",
+    )
 
 
 # Norms with their bounds, and inputs

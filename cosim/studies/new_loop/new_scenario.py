@@ -72,9 +72,9 @@ _OTHER_WEIGHT = 0.01
 """Weight of a state without an allowed error in the regulator, where others have one, with weight 1."""
 _INPUT_WEIGHTS = (1.0, 10.0, 100.0)
 """r of the regulators that are tried: with a larger one the gain is slower."""
-_FRICTION_INPUT_WEIGHTS = (1.0, 0.1, 0.01, 0.001, 1e-4)
+_FRICTION_INPUT_WEIGHTS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4)
 """The same with allowed errors and friction, which keeps an output off by its size over the gain."""
-_STICKING_SHARE = 0.2
+_STICKING_SHARE = 0.25
 """Of an allowed error, friction takes at most this, if a gain is stiff enough."""
 _SIZE_STEPS, _SIZE_TIME_CONSTANTS, _LEAST_SIZE = 400, 5.0, 1e-3
 """How long and how finely the linear loop is followed to see how large its states become; the least size
@@ -564,8 +564,15 @@ class _TrialScenarios:
         return weighted if self.certify(weighted)[0].exists else None
 
     def returns(self, trial: _Trial) -> bool:
-        """Whether the loop settles in virtual time, as the verdict of a run has it."""
+        """Whether the loop settles in virtual time, as the verdict of a run has it.
+
+        Raises:
+            CallerError: the plant cannot be simulated.
+        """
         run = simulate_loops(resolve_run(self.scenario(trial)))
+        for notice in run.loop().notices:
+            if notice["level"] == "failed":
+                raise CallerError(f"{self._model.plant.label}: {notice['text']}")
         sizes = np.linalg.norm(run.loop().columns("plant_step", "x")["x"], axis=1)
         return bool(np.isfinite(sizes).all() and sizes[-1] <= SETTLED_SHARE * sizes.max())
 

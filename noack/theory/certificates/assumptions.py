@@ -24,6 +24,8 @@ from noack.theory.coverage import key_table
 
 _NOT_COVERED = "not covered by the theorems and the certificates"
 _NOT_BY_THEOREMS = "not covered by the theorems"
+LINEAR_PLANT = "the plant is ẋ = Ax + Bu"
+"""What the paper assumes of a plant; a certificate of a plant's equations does not."""
 
 
 class AssumptionStatus(StrEnum):
@@ -103,7 +105,7 @@ def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     )
     why = f"largest real part of an eigenvalue: {nominal:.3g} /s (Â + B̂K){_other_sign(loop)}"
     return [
-        _violated("the plant is ẋ = Ax + Bu", "eq:plant", kind),
+        _violated(LINEAR_PLANT, "eq:plant", kind),
         _checked("the gain stabilises the model", "Theorem 2", nominal < 0, why),
     ]
 
