@@ -146,7 +146,8 @@ class Run:
             The table with the columns of ``docs/record.md``: times in nanoseconds of simulated
             time, and one column per entry of a vector (``x_1``, ``x_2``, …). The first column is
             ``t_s``, the time ``t_ns`` in seconds; the tables of plant, sensor and controller have
-            the number of the ``loop``. Of a loop of ``loops``, the rows of this loop.
+            the number of the ``loop``. Of a loop of ``loops``, the rows of this loop. Of one loop,
+            ``plant_step`` ends with the outputs that the scenario states, by their names.
 
         Raises:
             NoackError: there is no such table, or its file is damaged.
@@ -155,10 +156,12 @@ class Run:
             known = ", ".join(self.tables)
             raise CallerError(f'"{name}": the record has no such table; it has {known}')
         if self._loop is not None:
-            return data_frames.with_seconds(arrow_table(self._record[name]))
+            table = data_frames.with_seconds(arrow_table(self._record[name]))
+            return data_frames.with_outputs(table, self.scenario)
         path = self.directory / RECORD / f"{name}.parquet"
         file = TableFile(path, self._run.resolved.tables[name])
-        return data_frames.with_seconds(file.whole())
+        table = data_frames.with_seconds(file.whole())
+        return table if self._run.names[1:] else data_frames.with_outputs(table, self.scenario)
 
     def samples(self) -> pa.Table:
         """Return plant, sensor and controller side by side, one row per measurement.
@@ -199,7 +202,8 @@ class Run:
         """Draw a figure of the report.
 
         Args:
-            figure: states, errors, state-norm, input or inter-event; for a live run also lateness
+            figure: states, errors, state-norm, input or inter-event; outputs, if the scenario states
+                some; for a live run also lateness
                 or latency, and on hosts with different clocks clocks. Certified bounds are drawn
                 next to the bounded quantity. Of loops that share a network: network, loops or map.
 

@@ -16,6 +16,7 @@ from noack.protocol.record_tables import (
     effective,
     entry_names,
 )
+from noack.scenario.scenario import Scenario
 
 _NOT_RECEIVED = "none"
 _OUT_OF_ORDER = "delivered_out_of_order"
@@ -25,6 +26,20 @@ _IN_FLIGHT = "in_flight"
 def with_seconds(table: pa.Table) -> pa.Table:
     """Insert ``t_s``, the time ``t_ns`` in seconds, before the columns of a table."""
     return table.add_column(0, "t_s", pa.array(_seconds(table["t_ns"].to_numpy())))
+
+
+@np.errstate(all="ignore")  # a run may diverge
+def with_outputs(table: pa.Table, scenario: Scenario) -> pa.Table:
+    """Add each output that a scenario states to a table with the plant's x, by the output's name."""
+    outputs = scenario.loop_outputs() if scenario.outputs else ()
+    names = entry_names("x", len(outputs[0].row)) if outputs else ()
+    if names and set(names) <= set(table.column_names):
+        columns = [table[name].to_numpy() for name in names]
+        for output in outputs:
+            if output.name not in table.column_names:
+                values = np.column_stack(columns) @ np.array(output.row)
+                table = table.append_column(output.name, pa.array(values))
+    return table
 
 
 @np.errstate(all="ignore")  # a run may diverge

@@ -272,9 +272,10 @@ def _draw_intervals(figure: "Figure", t_s: Reals, transmissions: Transmissions) 
     draw_marks(received, lost_s, np.zeros(len(lost_s)), LOST, label="lost", marker="x", zorder=3)
 
     highest = max(np.nanmax(np.append(finite(gaps), 0.0)) for gaps in (since_sent, since_received))
-    for axes, title in ((sent, "Broadcasting intervals"), (received, "Receiving intervals")):
+    panels = ((sent, "Broadcasting intervals", sent_s), (received, "Receiving intervals", received_s))
+    for axes, title, times in panels:
         axes.set(title=title, ylabel="interval [s]", ylim=(0.0, 1.05 * highest or None))
-        mark_empty(axes, "fewer than two packets")
+        mark_empty(axes, "one packet" if len(times) else "no data")
         set_times(axes, t_s, labelled=axes is received)
     return [sent, received]
 

@@ -9,6 +9,8 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 ``error/log10``           decimal logarithms of these and of the certified bound (5 scalars)
 ``size/log10``            decimal logarithms of ‖x‖ (last of 3 scalars) and of its certified bounds:
                           from x(0), and from the newest event
+``output/<name>``         decimal logarithms of an output that the scenario states: its certified bound,
+                          its allowed error, its distance from what it follows (3 scalars)
 ``input``                 u = K x_c (m scalars)
 ``event/interval``        t_i − t_{i−1} in seconds, at every transmission
 ``event/stem``            its stem: 0, interval, NaN
@@ -50,6 +52,7 @@ from cosim.output.figures.palette import (
 from cosim.output.viewer.network_diagram import DIAGRAM, NetworkDiagram
 from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Picture, Shape, label, lines, panel
 from noack.core.references import Reference
+from noack.scenario.outputs import LoopOutput
 
 Static = rr.TextDocument | rr.SeriesLines | rr.SeriesPoints | Shape
 """Data that do not change during a run."""
@@ -75,6 +78,11 @@ _GLOBAL_VIEW = UUID("5c0dca6a-e63f-9cf7-f657-2602590474cc")
 def state_path(name: str) -> str:
     """Return the entity of a state coordinate; its name is escaped."""
     return f"state/{rr.escape_entity_path_part(name)}"
+
+
+def output_path(name: str) -> str:
+    """Return the entity of an output; its name is escaped."""
+    return f"output/{rr.escape_entity_path_part(name)}"
 
 
 def loop_folder(name: str) -> str:
@@ -103,6 +111,8 @@ class LoopLayout:
     """Diagram of the network, if there is one."""
     reference: Reference | None = None
     """The reference at the run's start; None is 0."""
+    outputs: Sequence[LoopOutput] = ()
+    """The outputs that the scenario states."""
     folder: str = ""
     """Entities of the loop are below it; it ends with a slash, or is empty."""
     phase_ns: int = 0
@@ -131,7 +141,7 @@ class LoopLayout:
         drawings = [] if self.picture is None else [panel(self.picture)]
         drawings += [] if self.diagram is None else [self.diagram.panel()]
         states, texts = _states(self.state_names), _texts(self)
-        norms, inputs, intervals = _norms(), plot("Control input u", INPUT), _intervals()
+        norms, inputs, intervals = _norms(self.outputs), plot("Control input u", INPUT), _intervals()
         if drawings:
             shares = [*[4, 3][: len(drawings)], 3.6]
             left: rrb.Container = rrb.Vertical(*drawings, texts, row_shares=shares)
@@ -168,8 +178,16 @@ def _styles(layout: LoopLayout) -> dict[str, Static]:
     colours = [IDENTITY, SENSOR, THRESHOLD, CONTROLLER, CERTIFIED]
     widths = [3.5, 1.5, 2.0, 1.5, 2.0]
     lateness = {lateness_path(process): line for process, line in _process_styles(layout.processes).items()}
+    of_output = [
+        (output_path(each.name), [f"{each.name}, certified", "allowed error", each.name])
+        for each in layout.outputs
+    ]
     return {
         **{state_path(name): of_state for name in layout.state_names},
+        **{
+            path: rr.SeriesLines(names=names, colors=[CERTIFIED, THRESHOLD, PLANT], widths=[2.0, 1.5, 2.5])
+            for path, names in of_output
+        },
         ERROR: rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4]),
         ERROR_LOG10: rr.SeriesLines(names=errors, colors=colours, widths=widths),
         SIZE_LOG10: rr.SeriesLines(
@@ -252,8 +270,10 @@ def _intervals() -> rrb.Container:
     )
 
 
-def _norms() -> rrb.Container:
-    return rrb.Tabs(plot("log10 ‖e‖", ERROR_LOG10), plot("‖e‖", ERROR), plot("log10 ‖x‖", SIZE_LOG10))
+def _norms(outputs: Sequence[LoopOutput]) -> rrb.Container:
+    of_outputs = [plot(f"log10 |{output.name}|", output_path(output.name)) for output in outputs]
+    errors = plot("log10 ‖e‖", ERROR_LOG10), plot("‖e‖", ERROR)
+    return rrb.Tabs(*of_outputs, *errors, plot("log10 ‖x‖", SIZE_LOG10))
 
 
 def _texts(layout: LoopLayout) -> rrb.Container:

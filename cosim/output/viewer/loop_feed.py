@@ -96,6 +96,7 @@ class LoopFeed:
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view
+        self._outputs = scenario.loop_outputs() if scenario.outputs else ()
         # Other tables are not shown.
         self._types = tables_of(scenario)
         self._pending: dict[str, list[Rows]] = {table: [] for table in SHOWN_TABLES}
@@ -191,7 +192,8 @@ class LoopFeed:
         of_state = np.column_stack(
             [self._certified_bound(t_s, "state"), self._bound_from_event(rows, aligned)]
         )
-        self._view.add_samples(thin, bounds[kept], of_state[kept])
+        of_outputs = np.array([self._certified_bound(t_s, "state", i) for i in range(len(self._outputs))])
+        self._view.add_samples(thin, bounds[kept], of_state[kept], of_outputs.reshape(-1, len(t_s)).T[kept])
         frames = Frames(t_s, aligned.x, aligned.x_s, aligned.x_c, z)
         shown = self._frames_to_show(len(t_s))
         self._view.add_frames(aligned.t_ns[shown], frames.at(shown))
@@ -218,10 +220,16 @@ class LoopFeed:
             self._view.add_certified_interval(certificate.inter_event_s, self._scenario.timing.horizon_ns)
         return certificate
 
-    def _certified_bound(self, t_s: Reals, quantity: Literal["controller_error", "state"]) -> Reals:
-        if self._certificate is None:
+    def _certified_bound(
+        self, t_s: Reals, quantity: Literal["controller_error", "state"], output: int | None = None
+    ) -> Reals:
+        """Return the certified bound of an error, of ‖x‖, or of an output by its number, (k,); or NaN."""
+        certificate = self._certificate
+        if certificate is None:
             return np.full(len(t_s), np.nan)
-        bound = getattr(self._certificate, quantity)(t_s)
+        if output is not None:
+            certificate = certificate.of_output(output, self._outputs[output].row)
+        bound = getattr(certificate, quantity)(t_s)
         return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
 
     @cached_property

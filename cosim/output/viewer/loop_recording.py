@@ -201,7 +201,9 @@ class LoopView:
         """Add one line to the loop's log; ``level`` is one of rerun's, such as INFO or WARN."""
         self._file.log(t_ns + self._layout.phase_ns, level, text, self._layout.folder)
 
-    def add_samples(self, aligned: AlignedRun, e_c_bounds: Reals, x_bounds: Reals) -> None:
+    def add_samples(
+        self, aligned: AlignedRun, e_c_bounds: Reals, x_bounds: Reals, y_bounds: Reals | None = None
+    ) -> None:
         """Add k samples.
 
         Args:
@@ -209,6 +211,7 @@ class LoopView:
             e_c_bounds: (k, 2) bounds of ‖e_c‖, from (I1) and certified; NaN for none.
             x_bounds: (k, 2) bounds of ‖x‖, certified from x(0) and from the newest event; NaN for
                 none.
+            y_bounds: (k, p) certified bounds of the layout's outputs; NaN for none. None: of all.
         """
         t_ns = aligned.t_ns
         states, reference = [aligned.x, aligned.x_s, aligned.x_c], self._layout.reference
@@ -224,6 +227,13 @@ class LoopView:
         self._send(bp.ERROR_LOG10, t_ns, _log10(norms, aligned.threshold))
         sizes = np.column_stack([x_bounds, np.linalg.norm(aligned.x, axis=1)])
         self._send(bp.SIZE_LOG10, t_ns, _log10(sizes, aligned.threshold))
+        deviations = aligned.x if reference is None else aligned.x - reference.states(t_ns)
+        for i, output in enumerate(self._layout.outputs):
+            bound = np.full(len(t_ns), np.nan) if y_bounds is None else y_bounds[:, i]
+            allowed = np.full(len(t_ns), np.nan if output.allowed is None else output.allowed)
+            distance = np.abs(deviations @ np.array(output.row))
+            of_output = np.column_stack([bound, allowed, distance])
+            self._send(bp.output_path(output.name), t_ns, _log10(of_output, allowed))
 
     def add_frames(self, t_ns: Times, frames: Frames) -> None:
         """Add states at times (k,) to the plant's picture, at its frame rate."""

@@ -213,6 +213,7 @@ def _loop_layout(
         picture=picture_of(scenario),
         diagram=NetworkDiagram(*scenario.network.flows[1:]) if animated else None,
         reference=loop.reference,
+        outputs=scenario.loop_outputs() if scenario.outputs else (),
         folder=folder,
         phase_ns=phase_ns,
     )
