@@ -117,6 +117,19 @@ def test_dry_friction_is_found_by_the_error() -> None:
     assert largest_errors(at, linear, np.full(2, 0.5), x0=x, u0=u)[0] > 0.1
 
 
+def test_a_step_is_left_out_if_it_is_steep_for_the_usual_deviations() -> None:
+    def shaft(_: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
+        return z[1], v[0] - 2.0 * z[1] - 3.0 * np.tanh(z[1] / 0.1) + np.sin(z[0])
+
+    def model(*sizes: float) -> np.ndarray:
+        system = OdeSystem(PlantEquations(shaft), np.zeros(2))
+        linear = linearise(lambda x0: system, 2, 1, beside=np.array(sizes))
+        return np.hstack([linear.A, linear.B])
+
+    assert np.allclose(model(1.0, 5.0, 5.0), [[0, 1, 0], [1, -2, 1]], atol=1e-6)  # sin has no step
+    assert np.allclose(model(1.0, 0.01, 5.0), [[0, 1, 0], [1, -32, 1]], atol=1e-6)
+
+
 def test_a_jump_at_the_point_is_left_out() -> None:
     """A shaft at standstill with dry and viscous friction has the slope of the viscous friction."""
 

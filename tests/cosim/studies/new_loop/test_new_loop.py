@@ -159,6 +159,47 @@ def test_one_command_leads_from_a_class_to_a_guarantee_in_its_own_units() -> Non
     assert noack.load("smaller").trigger.floor < scenario.trigger.floor / 5
 
 
+TABLE = """
+import math
+
+class Table:
+    states = ["angle, rad", "speed, rad/s"]
+    inputs = ["torque, N m"]
+    allowed = {"angle": 0.03}
+    initial_state = [0.6, 0.0]
+
+    def derivative(self, t_s, z, u):
+        friction = 0.05 * z[1] + 0.01 * FRICTION
+        return z[1], (u[0] - friction) / 0.02
+"""
+
+
+def test_dry_friction_is_left_out_of_the_model_and_kept_in_the_guarantee() -> None:
+    """Its tanh is steep for the speeds of the loop; the class may use math."""
+    Path("table.py").write_text(TABLE.replace("FRICTION", "math.tanh(z[1] / 0.05)"))
+    made = noack.new("table.py", "table.toml")
+    assert made.gain.model.A[1, 1] == pytest.approx(-2.5, rel=1e-3)  # of the viscous friction
+    promised = re.fullmatch(
+        r"angle stays within 0.03 rad of its set-point from ([\d.]+) s on, although up to 4 consecutive "
+        r"packets are lost \(proved\)",
+        made.guarantee,
+    )
+    assert promised is not None, made.guarantee
+    made.save("table.toml")
+    for seed in range(3):
+        run = noack.simulate(noack.load("table", {"seeds.loss": seed, "certificate.prove": False}))
+        rows = run.table("plant_step").to_pydict()
+        assert rows["angle"] == rows["x_1"]
+        late = np.array(rows["t_s"]) >= float(promised[1])
+        assert np.abs(np.array(rows["angle"])[late]).max() <= 0.03
+
+
+def test_friction_that_jumps_is_refused_with_what_to_write_instead() -> None:
+    Path("table.py").write_text(TABLE.replace("FRICTION", "math.copysign(1.0, z[1])"))
+    with pytest.raises(CallerError, match=r"table.py: .* cannot be integrated at .* write np.tanh\(v / w\)"):
+        noack.new("table.py", "table.toml")
+
+
 @pytest.mark.parametrize("name", ["cart_pole", "four_tank", "quadrotor"])
 def test_the_regulator_solves_the_riccati_equation(name: str) -> None:
     model = noack.linearise(name)
