@@ -314,14 +314,9 @@ class RunClaims:
             self.certificates = ()  # reading a finished run does not run the code of its plant
         envelopes = []
         for instance in self._checked:
-<<<<<<< HEAD
-            # Other bounds hold for deviations from a reference.
-            if (curve := instance.curve) and (instance.evidence is self.evidence):
-=======
-            # Other bounds hold for deviations from a set-point, as those of outputs do.
-            is_of_run = instance.run is self.evidence or instance.claimed.output is not None
+            # Other bounds hold for deviations from a reference, as those of outputs do.
+            is_of_run = instance.evidence is self.evidence or instance.claimed.output is not None
             if (curve := instance.curve) and is_of_run:
->>>>>>> 400c9400d (The report's first picture: each output with its certified bound and its allowed error, also for plants of one's own)
                 t_s = np.concatenate([part.t_s for part in curve])
                 values = np.concatenate([part.values for part in curve])
                 whole = curve[0]._replace(t_s=t_s, values=values)

@@ -64,6 +64,8 @@ from noack.trigger_policies.decaying import DecayingSettings
 
 _FLOOR_SHARE = 0.05
 """The floor of the threshold, as a share of beta."""
+_LARGEST_FLOOR_SHARE = 0.5
+"""The largest floor that is tried for the allowed errors, as a share of beta."""
 _FASTEST_ALPHA_PER_S = 1.0
 """α is at most this, unless allowed errors ask for a fast loop."""
 _RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0, 250.0, 500.0)
@@ -373,6 +375,8 @@ class _TrialScenarios:
     ) -> None:
         self._model, self._path, self._fixed_settings, self._allowed = model, path, fixed_settings, allowed
         self.is_linear = isinstance(model.plant.system, LinearSettings)
+        self._near: Sequence[Mapping[str, object]] = ()
+        """What was proven of the last trial."""
 
     def content(self, trial: _Trial) -> Table:
         """Return the content of the scenario file."""
@@ -425,6 +429,8 @@ class _TrialScenarios:
     def _first_floor(self, trial: _Trial, beta: float) -> float:
         """Return the last threshold that is tried first."""
         floor = _FLOOR_SHARE * beta
+        if self._allowed and not trial.has_friction and not self.is_linear:
+            floor = _LARGEST_FLOOR_SHARE * beta
         if trial.has_friction and self._allowed:
             floor = min(_FRICTION_FLOOR_SHARE * next(iter(self._allowed.values())), beta / 2)
         return to_digits(floor, 3)
@@ -458,7 +464,7 @@ class _TrialScenarios:
             is_enough = largest <= 1.0 and (largest >= _LEAST_USE or trial.has_friction)
             if is_enough or number == _MOST_THRESHOLDS - 1:
                 break
-            wanted = to_digits(min(used.floor * _MOST_USE / largest, used.beta / 2), 2)
+            wanted = to_digits(min(used.floor * _MOST_USE / largest, _LARGEST_FLOOR_SHARE * used.beta), 2)
             if wanted == used.floor:
                 break
             trial = replace(trial, floor=wanted)
@@ -478,7 +484,11 @@ class _TrialScenarios:
         return first
 
     def _easier(self, trial: _Trial) -> Iterator[_Trial]:
-        """Yield trials of which more is proven: with a slower threshold, and fewer losses."""
+        """Yield trials of which more is proven: with a smaller or slower threshold, and fewer losses."""
+        used = self.scenario(trial).trigger
+        if isinstance(used, DecayingSettings) and not trial.has_friction and not self.is_linear:
+            trial = replace(trial, floor=to_digits(_FLOOR_SHARE * used.beta, 2))
+            yield trial
         if "trigger.alpha_per_s" not in self._fixed_settings:
             trial = replace(trial, alpha_per_s=to_digits(_SLOWER * trial.alpha_per_s))
             yield trial
@@ -497,7 +507,8 @@ class _TrialScenarios:
         """Return the certificates of a trial, with the bounds that are proven."""
         results = certificates_of(self.scenario(trial), of_model=True)
         most_work = 2 * RUN_WORK if self.is_linear else MOST_WORK
-        results.prove(most_work=most_work, conditions=("schedule",))
+        found = results.prove(most_work=most_work, conditions=("schedule",), near=self._near)
+        self._near = [each.document for each in found.statements if each.document is not None] or self._near
         return results
 
     @staticmethod
