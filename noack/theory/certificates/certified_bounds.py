@@ -40,7 +40,9 @@ Constant = Literal["delta", "overshoot", "state", "estimation_error"]
 """A constant that bounds an output; :class:`Constants` has all."""
 _OUTPUTS: Mapping[Constant, str] = {"delta": "e_c", "overshoot": "e_s", "state": "x"}
 """The outputs of proven bounds."""
-LONGEST_S, _TIME_ACCURACY = 1e7, 1e-6
+LONGEST_S, _CLEARLY_SMALLER = 0.95
+"""A bound is worth a mention beside another one below this share of it."""
+_TIME_ACCURACY = 1e7, 1e-6
 """The longest run, and the relative accuracy of the time at which a bound is small enough."""
 _IN_LEVELS = ("delta", "overshoot")
 """Constants in units of the threshold."""
@@ -148,6 +150,11 @@ class ScenarioCertificate:
         reached = float(self.state(np.array([LONGEST_S]))[0])
         limit = math.inf if self.proven is None else self.proven.limits.get("x", math.inf)
         return min(reached, limit)
+
+    @property
+    def is_smaller_in_limit(self) -> bool:
+        """Whether a smaller bound is proven for t → ∞ than the one from the start on tends to."""
+        return self.ultimate_state < _CLEARLY_SMALLER * float(self.state(np.array([LONGEST_S]))[0])
 
     def settles_s(self, allowed: float) -> float | None:
         """Return from when on ‖x‖, or the output, is at most a value; None: it may exceed it for ever."""

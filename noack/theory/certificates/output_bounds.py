@@ -68,7 +68,9 @@ class OutputBound(NamedTuple):
         """What is certified, in words."""
         output, settles_s = self.output, self.settles_s
         if output.allowed is None:
-            return self.formula
+            least = output.quantity(at_most(self.ultimate, _DIGITS))
+            in_the_end = f", in the end ≤ {least}" if self.certificate.is_smaller_in_limit else ""
+            return f"{self.formula}{in_the_end}"
         allowed = output.quantity(f"{output.allowed:g}")
         if settles_s is not None:
             when = f"from {at_most(settles_s, _DIGITS)} s on" if settles_s else "at all times"
