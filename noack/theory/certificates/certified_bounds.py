@@ -40,10 +40,10 @@ Constant = Literal["delta", "overshoot", "state", "estimation_error"]
 """A constant that bounds an output; :class:`Constants` has all."""
 _OUTPUTS: Mapping[Constant, str] = {"delta": "e_c", "overshoot": "e_s", "state": "x"}
 """The outputs of proven bounds."""
-LONGEST_S, _CLEARLY_SMALLER = 0.95
-"""A bound is worth a mention beside another one below this share of it."""
-_TIME_ACCURACY = 1e7, 1e-6
+LONGEST_S, _TIME_ACCURACY = 1e7, 1e-6
 """The longest run, and the relative accuracy of the time at which a bound is small enough."""
+_CLEARLY_SMALLER = 0.95
+"""A bound is worth a mention beside another one below this share of it."""
 _IN_LEVELS = ("delta", "overshoot")
 """Constants in units of the threshold."""
 
