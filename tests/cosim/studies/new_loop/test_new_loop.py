@@ -161,6 +161,7 @@ def test_one_command_leads_from_a_class_to_a_guarantee_in_its_own_units() -> Non
 
 TABLE = """
 import math
+import numpy as np
 
 class Table:
     states = ["angle, rad", "speed, rad/s"]
@@ -195,7 +196,7 @@ def test_dry_friction_is_left_out_of_the_model_and_kept_in_the_guarantee() -> No
 
 
 def test_friction_that_jumps_is_refused_with_what_to_write_instead() -> None:
-    Path("table.py").write_text(TABLE.replace("FRICTION", "((z[1] > 0) - (z[1] < 0))"))
+    Path("table.py").write_text(TABLE.replace("FRICTION", "np.sign(z[1])"))
     with pytest.raises(CallerError, match=r"table.py: .* cannot be integrated at .* write np.tanh\(v / w\)"):
         noack.new("table.py", "table.toml")
 
