@@ -133,6 +133,7 @@ def test_the_way_of_the_readme_leads_from_a_plant_to_a_live_loop(
     """Its three commands, in their order; the first line of two of them is the sentence that it shows."""
     monkeypatch.chdir(tmp_path)
     (code,) = blocks("README.md", "python")
+    assert blocks("docs/tutorial.md", "python") == [code]  # it goes the same way
     Path("servo.py").write_text(code)
     (way,) = blocks("README.md", "console")
     shown = next(text for language, text in fences("README.md") if text.startswith("angle stays within"))
