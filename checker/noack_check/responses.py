@@ -32,6 +32,14 @@ class Decay(NamedTuple):
     form: arb_mat
     rate: arb
 
+    @property
+    def inverse(self) -> arb_mat:
+        """P⁻¹."""
+        try:
+            return self.form.inv()
+        except ZeroDivisionError:
+            raise RejectedError("a form is not proven to have an inverse") from None
+
     def require(self, M: arb_mat, name: str) -> None:
         """Raise RejectedError if this is not proven of a matrix."""
         P = self.form
@@ -54,7 +62,7 @@ def responses(
     for Y in inputs[1:]:
         Z = beside(Z, Y)
     start, time = Z, arb(0)
-    inverse, parts, first = P.inv(), [], 0
+    inverse, parts, first = decay.inverse, [], 0
     for Y in inputs:
         parts.append(range(first, first + Y.ncols()))
         first += Y.ncols()

@@ -80,6 +80,11 @@ def test_responses_are_those_of_quadrature(M: list[list[float]]) -> None:
         assert total * (1 - _OF_QUADRATURE) <= float(response.total) <= total * (1 + accuracy)
 
 
+def test_a_form_with_no_inverse_within_balls_is_rejected() -> None:
+    with pytest.raises(RejectedError, match="inverse"):
+        _ = Decay(matrix([[1.0, 1.0], [1.0, 1.0]]), number(1.0)).inverse
+
+
 def test_responses_up_to_a_time_may_grow() -> None:
     [[found]] = responses_until(matrix([[1.0]]), number(2.0), [identity(1)], [identity(1)])
     assert math.exp(2) <= float(found.most) <= math.exp(2) * 1.05
