@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TypeGuard
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from cosim.shipped_files import find_shipped, shipped_names, text_of
 from cosim.studies.new_loop import (
@@ -99,7 +98,7 @@ def with_settings(scenario: Scenario, settings: ReadTable) -> Scenario:
 
 def from_system(
     system: object,
-    gain: ArrayLike,
+    gain: object,
     initial_state: Sequence[float],
     *,
     plant: object = None,
@@ -123,14 +122,14 @@ def from_system(
 
     Args:
         system: the model ẋ = Âx + B̂u as a tuple (A, B) of matrices (n, n), per second, and (n, m);
-            or ``control.StateSpace`` or ``scipy.signal.StateSpace``, in continuous time, whose
-            output is the state.
-        gain: K of u = Kx, (m, n), which must stabilise the model. ``control.lqr`` and
-            ``scipy.signal.place_poles`` return the K of u = −Kx.
+            or ``control.StateSpace`` or ``scipy.signal.StateSpace``, whose output is the state; one in
+            discrete time, as ``control.c2d`` returns it, is taken back to continuous time.
+        gain: K of u = Kx, (m, n), which must stabilise the model; or what ``control.lqr``,
+            ``control.dlqr`` or ``scipy.signal.place_poles`` returned, whose K is that of u = −Kx.
         initial_state: x(0), n entries.
         plant: the true plant, as ``system``; by default it is the model, and x_s equals x.
         controller: a linear controller with states of its own, dξ/dt = Aξ + Bx, u = Cξ + Dx: a tuple (A,
-            B, C) or (A, B, C, D), or an object as for ``system``, in continuous time. By default u = Kx.
+            B, C) or (A, B, C, D), or an object as for ``system``. By default u = Kx.
         settings: as in :func:`with_settings`.
         name: of the scenario: letters, digits, _ and -.
         state_names: n names, for plots; by default the names in ``system``, or x_1, x_2, ….

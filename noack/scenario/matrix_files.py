@@ -2,9 +2,10 @@
 
 A file has a system ẋ = A x + B u and, optionally, the gain K of u = K x. An object is a
 ``control.StateSpace``, a ``scipy.signal.StateSpace``, or a tuple (A, B, C, D) or (A, B). In a
-complete state-space model C must be the identity, D zero and the time continuous, because the loop
-measures x. The loop's input is u = K x, but ``control.lqr`` and ``scipy.signal.place_poles`` return
-the gain of u = -K x.
+complete state-space model C must be the identity and D zero, because the loop measures x. A file is in
+continuous time; an object in discrete time, as ``control.c2d`` returns it, is taken back to continuous
+time. The loop's input is u = K x, but ``control.lqr`` and ``scipy.signal.place_poles`` return the gain of
+u = -K x: what they return as a whole has the right sign, a matrix alone is taken as it is.
 """
 
 import io
@@ -38,6 +39,8 @@ _MOST_ARRAYS = 1000
 _DIRECTORY_ENTRY = b"PK\1\2"
 """Begins each entry of an archive's directory."""
 _NUMBERS = "fiub"
+_SAMPLED = 1e-9
+"""Largest difference of samples, as a share of the largest entry, that is rounding."""
 
 
 def with_matrices(content: ReadTable, folder: Path, source: str) -> ReadTable:
@@ -250,13 +253,14 @@ def _missing(name: str, arrays: Arrays) -> str:
 
 def model_of(
     system: object,
-    gain: ArrayLike,
+    gain: object,
     *,
     state_names: Sequence[str] | None = None,
     input_names: Sequence[str] | None = None,
 ) -> ModelSection:
     """Return the model section of a scenario for a system and the gain K of u = K x, (m, n).
 
+    The gain is a matrix, or the result of ``control.lqr``, ``control.dlqr`` or ``scipy.signal.place_poles``.
     The names are for plots; by default they are those in a python-control object, if it has any.
 
     Raises:
@@ -278,7 +282,7 @@ def model_of(
         raise CallerError(f"the system: {brief(error)}") from None
 
 
-def save_model(path: str | Path, system: object, gain: ArrayLike | None = None) -> None:
+def save_model(path: str | Path, system: object, gain: object = None) -> None:
     """Write an ``.npz`` or ``.mat`` file for ``model.file`` or ``plant.file`` of a scenario.
 
     Without the gain K of u = K x, (m, n), the scenario must give it. Raise CallerError as
@@ -290,7 +294,7 @@ def save_model(path: str | Path, system: object, gain: ArrayLike | None = None) 
         raise CallerError(f"{path}: cannot be written: {why(error)}") from None
 
 
-def matrices_of(system: object, gain: ArrayLike | None = None) -> dict[str, Matrix]:
+def matrices_of(system: object, gain: object = None) -> dict[str, Matrix]:
     """Return the matrices of a system by name: A, (n, n), B, (n, m), and the gain if given, (m, n).
 
     Arguments and errors are those of :func:`model_of`.
@@ -300,16 +304,51 @@ def matrices_of(system: object, gain: ArrayLike | None = None) -> dict[str, Matr
     n, m = matrices["B"].shape
     try:
         require_shape(rows_of(matrices["A"]), "A", (n, n), "B has a row for each state")
+        matrices["A"], matrices["B"] = _in_continuous_time(matrices["A"], matrices["B"], dt)
         if gain is not None:
-            matrices[GAIN] = _finite_matrix(GAIN, gain)
+            matrices[GAIN] = _gain(gain)
             require_shape(rows_of(matrices[GAIN]), GAIN, (m, n), "a row per input, a column per state")
     except ValueError as error:
         raise CallerError(f"the system: {error}") from None
-    if (reason := unfit(C, D, dt, n)) is not None:
+    if (reason := unfit(C, D, None, n)) is not None:
         raise CallerError(f"the system: {reason}")
     if gain is not None and (reason := instability(matrices["A"], matrices["B"], matrices[GAIN])) is not None:
         raise CallerError(f"gain: {reason}")
     return matrices
+
+
+def _gain(given: Any) -> Matrix:
+    """Return K of u = Kx from a matrix, or from (K, S, E) or an object of a library, whose K is of u = −Kx."""
+    if isinstance(given, tuple) and len(given) == 3 and np.ndim(given[0]) == 2:
+        return -_finite_matrix(GAIN, given[0])
+    if hasattr(given, "gain_matrix"):
+        return -_finite_matrix(GAIN, given.gain_matrix)
+    return _finite_matrix(GAIN, given)
+
+
+def _in_continuous_time(A: Matrix, B: Matrix, dt: ArrayLike | None) -> tuple[Matrix, Matrix]:
+    """Return the system whose samples, with an input that is held, are those of one with a sampling time.
+
+    Raises:
+        ValueError: there is none, or the sampling time is not stated.
+    """
+    if _discrete(dt) is None:
+        return A, B
+    if isinstance(dt, bool | np.bool_) or not float(np.asarray(dt).ravel()[0]) > 0:
+        raise ValueError("dt: the sampling time is not stated; give it in seconds")
+    from scipy.linalg import expm, logm  # imported here: it takes time
+
+    (n, m), step_s = B.shape, float(np.asarray(dt).ravel()[0])
+    whole = np.block([[A, B], [np.zeros((m, n)), np.eye(m)]])
+    with warnings.catch_warnings(action="ignore"):
+        exponent = np.asarray(logm(whole))
+    rate = exponent.real / step_s
+    if (
+        not np.isfinite(rate).all()
+        or np.abs(expm(exponent.real) - whole).max() > _SAMPLED * np.abs(whole).max()
+    ):
+        raise ValueError("dt: no system in continuous time has these samples; give the continuous one")
+    return rate[:n, :n], rate[:n, n:]
 
 
 def _parts(system: object, what: str, sizes: tuple[int, ...]) -> Sequence[Any]:
@@ -332,17 +371,22 @@ def controller_of(system: object) -> dict[str, object]:
 
     Args:
         system: dξ/dt = A ξ + B x, u = C ξ + D x: a tuple (A, B, C) or (A, B, C, D), or an object of
-            python-control or SciPy, in continuous time. Without D, u = C ξ + K x.
+            python-control or SciPy. Without D, u = C ξ + K x.
 
     Raises:
-        CallerError: it is none, or in discrete time.
+        CallerError: it is none, or no system in continuous time has its samples.
     """
     *matrices, dt = _parts(system, "controller", (3, 4))
-    if (reason := _discrete(dt)) is not None:
-        raise CallerError(f"controller: {reason}")
-    named = {key: M for key, M in zip("ABCD", matrices, strict=True) if M is not None}
-    rows = {key: _finite_matrix(f"controller.{key}", M).tolist() for key, M in named.items()}
-    return {"kind": "state_space", **rows}
+    named = {
+        key: _finite_matrix(f"controller.{key}", M)
+        for key, M in zip("ABCD", matrices, strict=True) if M is not None
+    }  # fmt: skip
+    if len(named["A"]) == len(named["A"].T) == len(named["B"]):
+        try:
+            named["A"], named["B"] = _in_continuous_time(named["A"], named["B"], dt)
+        except ValueError as error:
+            raise CallerError(f"controller: {error}") from None
+    return {"kind": "state_space", **{key: M.tolist() for key, M in named.items()}}
 
 
 def _finite_matrix(name: str, value: ArrayLike) -> Matrix:

@@ -10,7 +10,8 @@ from scipy import signal
 from scipy.io import loadmat, savemat
 from scipy.sparse import csc_matrix
 
-from noack.scenario.matrix_files import model_of, save_model
+from noack.core.errors import CallerError
+from noack.scenario.matrix_files import controller_of, model_of, save_model
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, load
@@ -130,3 +131,44 @@ def test_a_saved_system_is_read_back(suffix: str, read: Any, tmp_path: Path) -> 
         assert np.array_equal(matrices[name], expected)
     save_model(path, (A, B))
     assert "gain" not in read(path)
+
+
+def test_what_python_control_returns_goes_in_as_it_is() -> None:
+    control = pytest.importorskip("control")
+    system = control.ss(A, B, C, D)
+    design = control.lqr(system, np.eye(2), [[1.0]])
+    assert model_of(system, design).gain == model_of(system, -design[0]).gain
+    sampled = control.c2d(system, 0.01)
+    for each in (sampled, signal.StateSpace(sampled.A, sampled.B, C, D, dt=0.01)):
+        found = model_of(each, control.dlqr(sampled, np.eye(2), [[1.0]]))
+        assert np.array(found.A) == pytest.approx(A, abs=1e-9)
+        assert np.array(found.B) == pytest.approx(B, abs=1e-9)
+    placed = signal.place_poles(A, B, [-2.0, -3.0])
+    closed_loop = A + B @ np.array(model_of((A, B), placed).gain)
+    assert sorted(np.linalg.eigvals(closed_loop).real) == pytest.approx([-3.0, -2.0])
+    with pytest.raises(CallerError, match="u = -K x does"):
+        model_of((A, B), control.place(A, B, [-2.0, -3.0]))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "dt", "message"),
+    [
+        ([[-0.5]], 0.1, "no system in continuous time has these samples"),
+        ([[0.5]], True, "time is not stated"),
+    ],
+)
+def test_samples_of_no_system_are_refused(matrix: Any, dt: Any, message: str) -> None:
+    system = SimpleNamespace(A=matrix, B=[[1.0]], C=[[1.0]], D=[[0.0]], dt=dt)
+    with pytest.raises(CallerError, match=message):
+        model_of(system, [[-1.0]])
+    with pytest.raises(CallerError, match=message):
+        controller_of(system)
+
+
+def test_a_controller_in_discrete_time_is_taken_back() -> None:
+    exact = (np.array([[-1.0]]), np.array([[2.0, 0.0]]), [[3.0]], [[0.0, 0.0]])
+    sampled = signal.cont2discrete(exact, 0.02)[:2]
+    given = SimpleNamespace(A=sampled[0], B=sampled[1], C=exact[2], D=exact[3], dt=0.02)
+    table = controller_of(given)
+    assert np.array(table["A"]) == pytest.approx(exact[0])
+    assert np.array(table["B"]) == pytest.approx(exact[1], abs=1e-9)
