@@ -318,7 +318,7 @@ def matrices_of(system: object, gain: object = None) -> dict[str, Matrix]:
 
 
 def _gain(given: Any) -> Matrix:
-    """Return K of u = Kx from a matrix, or from (K, S, E) or an object of a library, whose K is of u = −Kx."""
+    """Return K of u = Kx from a matrix, or from a library's (K, S, E) or object, whose K is of u = −Kx."""
     if isinstance(given, tuple) and len(given) == 3 and np.ndim(given[0]) == 2:
         return -_finite_matrix(GAIN, given[0])
     if hasattr(given, "gain_matrix"):
