@@ -368,16 +368,22 @@ def try_likely_patterns(search: PatternSearch, scenario_pattern: Pattern, rng: n
 
 
 def _candidates(guarantee: LossGuarantee, events: int, rng: np.random.Generator) -> list[Pattern]:
-    """Return patterns of that many events: without losses, regular ones, random ones.
+    """Return patterns of that many events: without losses, regular ones, random ones."""
+    if guarantee.longest_burst == 0:
+        return [()]
+    share = rng.uniform(size=(_RANDOM, 1))
+    random = rng.uniform(size=(_RANDOM, events)) < share
+    return [(), *regular_patterns(guarantee, events), *(tuple(row) for row in random.tolist())]
 
-    A regular pattern loses the first updates of each period; with a further constraint, the period
-    may be its window.
+
+def regular_patterns(guarantee: LossGuarantee, events: int) -> list[Pattern]:
+    """Return patterns of that many events, each of which loses the first updates of each period.
+
+    With a further constraint, the period may be its window.
     """
     longest = events if guarantee.longest_burst is None else guarantee.longest_burst
-    if longest == 0:
-        return [()]
     lengths = [window.packets for window in guarantee.windows[1:] if window.packets <= _PERIODS]
-    regular = [
+    return [
         tuple((i + phase) % period >= lost for i in range(events))
         for lost in range(1, longest + 1)
         for period in (
@@ -386,9 +392,6 @@ def _candidates(guarantee: LossGuarantee, events: int, rng: np.random.Generator)
         )
         for phase in range(period)
     ]
-    share = rng.uniform(size=(_RANDOM, 1))
-    random = rng.uniform(size=(_RANDOM, events)) < share
-    return [(), *regular, *(tuple(row) for row in random.tolist())]
 
 
 def improve(search: PatternSearch, pattern: Pattern, value: float, most_nodes: int) -> None:

@@ -182,10 +182,13 @@ def print_worst(
         console.print("[dim]share used: of the certified bound, by the worst losses[/]")
     if trigger == "sampled" and _is_shaped(certificate):
         console.print("[dim]Scaled: multiplied by bound(0) / bound(t)[/]")
-    if certificate.void is not None:
+    if certificate.void is not None and not certificate.exists:
         console.print(f"[dim]Nothing is certified: {escape(certificate.void)}[/]")
     elif trigger == "sampled":
-        console.print("[dim]certified: computed for the scenario's schedule, without lateness[/]")
+        how = "computed for the scenario's schedule, without lateness"
+        if certificate.proven is not None:
+            how = "proved for the scenario's schedule"
+        console.print(f"[dim]certified: {how}[/]")
     console.print("[dim]One letter per event: D delivered, L lost. --json prints their times[/]")
 
 
@@ -230,4 +233,7 @@ def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: s
 def _is_shaped(certificate: ScenarioCertificate) -> bool:
     """Return whether the bounds are not c e^{−rt}."""
     others = (certificate.persistent_constants, certificate.floor_constants, certificate.other)
-    return any(other is not None for other in others)
+    is_sum = certificate.proven is not None and any(
+        bound.decaying and bound.constant for bound in certificate.proven.bounds.values()
+    )
+    return is_sum or any(other is not None for other in others)

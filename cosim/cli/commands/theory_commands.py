@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Option
@@ -14,6 +14,10 @@ from cosim.output.requirement import Requirement
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.command_line import StopRequestError, print_to_stderr
+
+if TYPE_CHECKING:
+    from noack.scenario.scenario import Scenario
+    from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 app = typer.Typer()
 
@@ -201,7 +205,8 @@ def adversary(
     The loop is that of the processes; with --trigger continuous it is the paper's, without delays.
     Exit status 1: a certified bound was exceeded.
 
-    Takes some 20 s if all patterns can be tried; otherwise about as long for each objective.
+    Takes some 20 s if all patterns can be tried; otherwise about as long for each objective. Of a plant
+    that is not given by matrices, some hundred patterns are simulated.
     """
     from cosim.analysis import adversary as adversary_search
     from cosim.analysis.adversary.worst_run import WorstRun, document, print_worst
@@ -221,15 +226,24 @@ def adversary(
     continuous = trigger is opt.TriggerMode.CONTINUOUS
     if continuous:
         warn_of_left_out(resolved)
-    conditions = adversary_search.conditions_of(resolved, continuous=continuous)
-    certificate = certify_scenario(resolved, conditions)
+    by_runs = not continuous and not resolved.coverage.is_linear
+    if by_runs:
+        certificate = _region_certificate(resolved)
+    else:
+        certificate = certify_scenario(
+            resolved, adversary_search.conditions_of(resolved, continuous=continuous)
+        )
     kinds, is_all = adversary_search.Objective, objective is AdversaryAim.ALL
     aims = list(kinds) if is_all else [kinds(objective.value)]
     worst_cases: list[WorstRun] = []
     stopped: StopRequestError | None = None
     try:
         with search_activity() as report:
-            for aim in aims:
+            if by_runs:
+                worst_cases += adversary_search.find_worst_by_runs(
+                    resolved, aims, certificate, report=report("losses")
+                )
+            for aim in () if by_runs else aims:
                 worst = adversary_search.find_worst(
                     resolved,
                     aim,
@@ -253,6 +267,23 @@ def adversary(
         print_to_stderr(f"noack: {stopped}; missing: {missing}")
         return stopped.exit_status
     return ExitStatus.FAILED if any(worst.breaches for worst in worst_cases) else ExitStatus.OK
+
+
+def _region_certificate(resolved: "Scenario") -> "ScenarioCertificate":
+    """Return the certificate of a plant that is not given by matrices, as ``noack certify`` proves it.
+
+    Raises:
+        CallerError: it has none.
+    """
+    from cosim.analysis.certificates import certificates_of
+    from cosim.live.monitoring.progress import work_bar
+
+    results = certificates_of(resolved, of_model=True)
+    with work_bar("searching for proofs", lines=True) as bar:
+        results.prove(bar, conditions=("schedule",))
+    if (certificate := results.of_own_plant) is None or not certificate.exists:
+        raise CallerError(results.answer.text)
+    return certificate
 
 
 @app.command(
