@@ -35,7 +35,7 @@ _GUESSED_SHARE = 0.6
 """Share of the runs before single outcomes are changed."""
 
 
-class _Run(NamedTuple):
+class _PatternRun(NamedTuple):
     """A simulated run: of each objective the largest value, and when it is reached."""
 
     pattern: Pattern
@@ -61,7 +61,7 @@ def find_worst_by_runs(
         report: receives the progress.
     """
     began_s = time.monotonic()
-    runs = _Runs(resolved, certificate, objectives, report)
+    runs = _PatternRuns(resolved, certificate, objectives, report)
     own_fates = network_fates(resolved)
     lossless = runs.of(())
     events = len(lossless.pattern)
@@ -100,7 +100,7 @@ def find_worst_by_runs(
     return found
 
 
-class _Runs:
+class _PatternRuns:
     """The runs of a scenario, by their patterns."""
 
     def __init__(
@@ -112,7 +112,7 @@ class _Runs:
     ) -> None:
         self._resolved, self._certificate, self._report = resolved, certificate, report
         self._objectives = objectives
-        self._known: dict[Pattern, _Run] = {}
+        self._known: dict[Pattern, _PatternRun] = {}
         self._delay_ns = network_delay_ns(resolved, 0)
         self.events = 0
         """Of all runs."""
@@ -120,7 +120,7 @@ class _Runs:
     def __len__(self) -> int:
         return len(self._known)
 
-    def of(self, pattern: Pattern) -> _Run:
+    def of(self, pattern: Pattern) -> _PatternRun:
         """Return the run of a pattern.
 
         Updates after its end arrive, and those whose loss the guarantee forbids.
@@ -133,7 +133,7 @@ class _Runs:
             self._report("runs", self.events, value)
         return self._known[pattern]
 
-    def worst(self, objective: Objective) -> _Run:
+    def worst(self, objective: Objective) -> _PatternRun:
         """Return the worst run so far."""
         return max(self._known.values(), key=lambda run: run.values[objective][0])
 
@@ -150,14 +150,14 @@ class _Runs:
             else:
                 return
 
-    def _simulated(self, pattern: Pattern) -> _Run:
+    def _simulated(self, pattern: Pattern) -> _PatternRun:
         network = _PatternNetwork(self._resolved, pattern, self._delay_ns)
         record = simulate(self._resolved, network)
         values = {
             objective: _value(record, objective, self._certificate, network.event_s)
             for objective in self._objectives
         }
-        return _Run(tuple(network.delivered), tuple(network.event_s), values)
+        return _PatternRun(tuple(network.delivered), tuple(network.event_s), values)
 
 
 class _PatternNetwork:
