@@ -1,70 +1,371 @@
-"""The growth of a loop with a time-triggered sensor under every pattern of losses, or under one of them.
+"""The growth of a loop that transmits at least at some times, under every pattern of losses, or under one.
 
-The sensor transmits x, which it knows, every T; nothing is late, and nothing disturbs the loop. From one
-transmission to the next the state z = (x, x_c, u, w, older x) is multiplied by a matrix D, if an update
-arrives before the next transmission, and else by L: u is the input that the plant applies, w the newest one
-of the controller, and the older x are those of transmissions whose updates are on their way. Both depend on
-the place of T relative to the controller's ticks, which repeats after some transmissions, the slots.
+The sensor transmits x, which it knows, some units of time after the transmission before, whatever it
+measures: the unit is its period, or the time between two measurements. Nothing is late, and nothing
+disturbs the loop; with a set-point or a safe input the state is the difference of two runs. Periods
+that are no whole nanoseconds are exact. With z = (x, x_c, u, older x) at a transmission whose update arrives,
+u the input that the plant applies, and the older x those of transmissions whose updates are on their way:
 
-A *word* is what is known of the outcomes so far: it is how they end. A witness has words, each with a
-positive definite matrix P for every slot. From a word w, outcome o leads to the longest word that w·o ends
-with. If for all slots and words, and all outcomes that the guarantee allows there,
+* a *burst* leads from this transmission to the next one whose update arrives, some units later. Whatever
+  was lost between, it multiplies z by one matrix. This depends on the number of units, on the place of the
+  first transmission relative to the controller's ticks, the *slot*, and, if updates expire, on how much
+  longer the update before it is used.
+* A *node* is all that bursts depend on after it: the state of the guarantee, the slot, and that time.
+  Nodes with the same futures are one.
 
-    Mᵀ P_to M ⪯ ρ² P_from,    M = D or L,
+A witness has a positive definite P for every node; a node may also remember the last bursts, for which
+the graph is replaced by that of its bursts. If every path from a node v has a beginning with the product Π,
+of d units, and the end w, so that
 
-then no pattern grows faster than by ρ per period, in the long run: with √(zᵀPz) as its measure. "D" has to
-be a word, since each pattern has a delivery, from which on there is a word.
+    Πᵀ P_w Π ⪯ ρ²ᵈ P_v,
 
-An outcome belongs to the update that arrives, or would, between two transmissions.
+then no pattern grows faster than by ρ per unit in the long run, with √(zᵀPz) as its measure. The beginnings
+are found here: bursts are added to a product until the inequality holds, up to some number.
 
-A pattern that is repeated has the product Π of its matrices over all slots. |tr Π^k| ≤ N · (spectral radius
-of Π)^k, N its size: so some z grows at least by (|tr Π^k| / N)^(1/k) over that time.
+A pattern that is repeated has the product Π of its matrices. |tr Π^k| ≤ N · (spectral radius of Π)^k, N its
+size: so some z grows at least by (|tr Π^k| / N)^(1/k) over that time. In coordinates in which Π is nearly
+diagonal, balls grow less from power to power.
 """
 
-from collections.abc import Mapping
-from itertools import pairwise, product
-from math import lcm
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from functools import cached_property
+from itertools import pairwise
+from math import ceil, gcd, lcm
 from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
 from noack_check.balls import identity, is_positive, rows_of, stack, transpose, zeros
 from noack_check.check import RejectedError
-from noack_check.document import read_count, read_matrix, read_number, read_table
+from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
 from noack_check.keys import RefusedError, Table
-from noack_check.loop import Loop
-from noack_check.scenario import constant_delay_ns, loss_windows, read_loop, read_schedule
-from noack_check.times import NS_PER_S, Schedule
+from noack_check.scenario import (
+    constant_delay_ns,
+    loss_rules,
+    read_linear_loop,
+    read_schedule,
+    times_between_events,
+    update_timeout,
+)
+from noack_check.times import NS_PER_S
 
-_MOST_STEPS, _MOST_SLOTS, _MOST_SIZE = 20_000, 64, 80
-_MOST_WORDS, _LONGEST = 300, 1000
+_MOST_STEPS, _MOST_SLOTS, _MOST_SIZE, _MOST_UNITS = 20_000, 64, 80, 100_000
+MOST_BURSTS = 5000
+_MOST_MEMORY, _LONGEST = 8, 1000
+_MOST_PRODUCTS = 5000
+"""Of two bursts and more, for all nodes: some seconds."""
+_LONGEST_PRODUCT = 40
+"""Bursts of a product: balls become larger with each."""
 _MOST_SQUARINGS = 40
 _DEFINITE = arb(2) ** -100
 """A form is definite if it is positive with so much less."""
-_STEP, _ARRIVAL, _TICK = range(3)
-"""What happens at one time, in this order; a transmission comes after a step."""
+
+State = tuple[int, tuple[int, ...], tuple[int, ...]]
+"""Losses in a row, the outcomes of each window as bits, deliveries since the last loss."""
 
 
-class PeriodicLoop(NamedTuple):
-    """What happens between two transmissions, by slot, and which losses the guarantee allows."""
+class Guarantee(NamedTuple):
+    """Which outcomes of successive updates are allowed."""
 
-    delivered: tuple[arb_mat, ...]  # D
-    lost: tuple[arb_mat, ...]  # L
     losses: int  # most consecutive losses
-    windows: tuple[tuple[int, int], ...]  # at most the first number of losses in the second number of updates
-    period: fmpq  # s
+    windows: tuple[tuple[int, int], ...] = ()  # most losses, in so many successive updates
+    recoveries: tuple[int, ...] = ()  # so many deliveries at least between two bursts of losses
 
-    def allows_loss(self, word: str) -> bool:
-        """Return whether a loss may follow outcomes that end with a word."""
-        in_a_row = len(word) - len(word.rstrip("L"))
-        recent = (word[max(len(word) - window + 1, 0) :].count("L") < most for most, window in self.windows)
-        return in_a_row < self.losses and all(recent)
+    @property
+    def start(self) -> State:
+        """The state before the first update, and after sufficiently many deliveries."""
+        return 0, (0,) * len(self.windows), self.recoveries
+
+    def after(self, state: State, *, lost: bool) -> State | None:
+        """Return the state after an outcome; None: it is not allowed."""
+        in_a_row, windows, since = state
+        recent = tuple(bits << 1 | lost for bits in windows)
+        if lost:
+            is_allowed = in_a_row < self.losses
+            is_allowed &= all(
+                bits.bit_count() <= most for bits, (most, _) in zip(recent, self.windows, strict=True)
+            )
+            is_allowed &= all(k in (0, least) for k, least in zip(since, self.recoveries, strict=True))
+            if not is_allowed:
+                return None
+        kept = tuple(
+            bits & ((1 << (window - 1)) - 1) for bits, (_, window) in zip(recent, self.windows, strict=True)
+        )
+        delivered = tuple(
+            0 if lost else min(k + 1, least) for k, least in zip(since, self.recoveries, strict=True)
+        )
+        return in_a_row + 1 if lost else 0, kept, delivered
+
+
+class Times(NamedTuple):
+    """The times of a loop, in whole parts of a nanosecond."""
+
+    step: int  # of the plant
+    tick: int  # of the controller
+    phase: int  # of its first tick
+    unit: int  # of transmissions; a multiple of a step
+    rest: int  # what is left of an update's delay after whole units
+    behind: int  # whole units of an update's delay
+    timeout: int | None  # age from which on an update is not used; None: it always is
+    holds_input: bool  # the input is then held; else it is 0
+    parts: int  # of a nanosecond
+
+    def seconds(self, duration: int) -> fmpq:
+        """Return a time in s."""
+        return fmpq(duration, self.parts * NS_PER_S)
+
+    @property
+    def slots(self) -> int:
+        """Number of units after which their times repeat, relative to the ticks."""
+        cycle = lcm(self.step, self.tick)
+        return cycle // gcd(cycle, self.unit)
+
+    def usable(self, units: int) -> int:
+        """Return how much longer an update is used that was sent so long ago; up to the delay."""
+        if self.timeout is None:
+            return self.rest
+        return min(max(self.timeout - units * self.unit, 0), self.rest)
+
+
+class Burst(NamedTuple):
+    """What may happen from one transmission whose update arrives to the next one."""
+
+    source: int
+    target: int
+    slot: int
+    usable: int
+    """How long the update before is used after the first transmission."""
+    losses: int
+    units: int
+
+
+def list_bursts(guarantee: Guarantee, times: Times, between: range) -> list[Burst]:
+    """Return all bursts; node 0 is that of the first transmission.
+
+    Of several with the same nodes and units, the one with the fewest losses stands for all.
+
+    Args:
+        guarantee: the outcomes that are allowed.
+        times: of the loop.
+        between: numbers of units that may be between two transmissions.
+
+    Raises:
+        RefusedError: there are more than 5,000.
+    """
+    first = guarantee.after(guarantee.start, lost=False)
+    begin = first, 0, times.usable(1)
+    numbers, pending = {begin: 0}, [begin]
+    bursts: dict[tuple[int, int, int], Burst] = {}
+    while pending:
+        node = state, slot, usable = pending.pop()
+        source, sent = numbers[node], 0
+        while state is not None:
+            sent += 1
+            after = guarantee.after(state, lost=False)
+            for units in range(sent * between[0], sent * between[-1] + 1):
+                target = after, (slot + units) % times.slots, times.usable(units)
+                if target not in numbers:
+                    numbers[target] = len(numbers)
+                    pending.append(target)
+                burst = Burst(source, numbers[target], slot, usable, sent - 1, units)
+                bursts.setdefault((source, numbers[target], units), burst)
+            if len(bursts) > MOST_BURSTS:
+                raise RefusedError(f"more than {MOST_BURSTS:,} transitions")
+            state = guarantee.after(state, lost=True)
+    return _merged(list(bursts.values()))
+
+
+def _merged(bursts: Sequence[Burst]) -> list[Burst]:
+    """Return the graph with one node for all that have the same futures, numbered anew.
+
+    Nodes are divided as long as bursts of one class differ in their losses, times or targets' class.
+    """
+    leaving: dict[int, list[Burst]] = {}
+    for burst in bursts:
+        leaving.setdefault(burst.source, []).append(burst)
+    classes, count = dict.fromkeys(sorted(leaving), 0), 0
+    while len(set(classes.values())) > count:
+        count = len(set(classes.values()))
+        merged = {
+            node: frozenset((*burst[2:], classes[burst.target]) for burst in leaving[node])
+            for node in classes
+        }
+        numbers = {future: number for number, future in enumerate(dict.fromkeys(merged.values()))}
+        classes = {node: numbers[future] for node, future in merged.items()}
+    first = {number: node for node, number in reversed(classes.items())}
+    return [
+        burst._replace(source=number, target=classes[burst.target])
+        for number, node in sorted(first.items())
+        for burst in leaving[node]
+    ]
+
+
+def remembering(bursts: Sequence[Burst], memory: int) -> list[Burst]:
+    """Return the graph in which a node also remembers the last bursts, so many of them."""
+    for _ in range(memory):
+        following: dict[int, list[int]] = {}
+        for number, burst in enumerate(bursts):
+            following.setdefault(burst.source, []).append(number)
+        ends = [following[burst.target] for burst in bursts]
+        if sum(map(len, ends)) > MOST_BURSTS:
+            raise RejectedError(f"memory: more than {MOST_BURSTS:,} transitions")
+        bursts = [
+            bursts[number]._replace(source=source, target=number)
+            for source, numbers in enumerate(ends)
+            for number in numbers
+        ]
+    return list(bursts)
+
+
+class PeriodicLoop:
+    """A loop that transmits at least at some times.
+
+    Args:
+        matrices: A, B, K and H.
+        times: its times.
+        between: numbers of units that may be between two transmissions.
+        guarantee: the outcomes that are allowed.
+    """
+
+    def __init__(
+        self,
+        matrices: tuple[arb_mat, arb_mat, arb_mat, arb_mat],
+        times: Times,
+        between: range,
+        guarantee: Guarantee,
+    ) -> None:
+        self.matrices, self.times = matrices, times
+        self.between, self.guarantee = between, guarantee
+        A, B, K, H = matrices
+        n, m, behind = A.nrows(), B.ncols(), times.behind
+        at = [0, n, 2 * n, 2 * n + m, *(2 * (n + m) + i * n for i in range(behind + 1))]
+        self._whole = identity(at[-1])
+        x, x_c, u, w, *older = (rows_of(self._whole, range(begin, end)) for begin, end in pairwise(at))
+        still = zeros(at[-1] - 2 * n, at[-1])
+        self._generator = stack([A * x + B * u, H * x_c, still])
+        self._step = stack([x, x_c, w, w, *older])
+        self._ticks = (
+            stack([x, x_c, u, K * x_c, *older]),
+            stack([x, x_c, u, w if times.holds_input else 0 * w, *older]),
+        )
+        delay_s = times.seconds(behind * times.unit + times.rest)
+        sent = [x, *older]
+        self._arrived_x_c = (arb(delay_s) * H).exp() * sent[-1]
+        self._loop = stack([x, x_c, u, w])
+        self._sent = stack(sent[:-1]) if behind else None
+        # A step comes before a transmission, so that u = w there. What arrives at once replaces x_c.
+        kept = [*range(n), *(range(n, 2 * n) if delay_s > 0 else ()), *range(2 * n, 2 * n + m)]
+        kept += range(2 * (n + m), at[-1])
+        self._kept, self.size = kept, len(kept)
+        inputs = {2 * n + i: 2 * n + m + i for i in range(m)}
+        self._from_kept = arb_mat(
+            at[-1], len(kept), [int(i in (j, inputs.get(j))) for i in range(at[-1]) for j in kept]
+        )
+        self._flows: dict[int, arb_mat] = {}
+        self._advances: dict[tuple[int, int, bool], arb_mat] = {}
+        self._after: dict[tuple[int, int], list[arb_mat]] = {}
+        self._matrices: dict[tuple[int, int, int], arb_mat] = {}
+
+    def under(self, guarantee: Guarantee) -> "PeriodicLoop":
+        """Return the same loop with another guarantee."""
+        other = PeriodicLoop.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        other.__dict__.pop("bursts", None)
+        other.guarantee = guarantee
+        return other
+
+    @cached_property
+    def bursts(self) -> list[Burst]:
+        """The graph of what may happen; see :func:`list_bursts`."""
+        return list_bursts(self.guarantee, self.times, self.between)
+
+    def seconds(self, units: int) -> fmpq:
+        """Return a time in s."""
+        return self.times.seconds(units * self.times.unit)
+
+    def matrix(self, burst: Burst) -> arb_mat:
+        """Return the matrix of z over a burst."""
+        key = burst.slot, burst.usable, burst.units
+        if key not in self._matrices:
+            self._matrices[key] = self._over(*key)
+        return self._matrices[key]
+
+    def _over(self, slot: int, usable: int, units: int) -> arb_mat:
+        states, T = self._after.setdefault((slot, usable), []), self.times
+        begin = slot * T.unit
+        expires = None if T.timeout is None else begin + T.timeout
+        while len(states) < units:
+            now = begin + len(states) * T.unit
+            if states:
+                state, step = states[-1], self._advance(now, now + T.unit, expires)
+            else:
+                state, arrives = self._from_kept, now + T.rest
+                before = self._advance(now, arrives, None if T.timeout is None else now + usable)
+                # What arrives was sent before, and what is under way does not change until the end.
+                step = self._advance(arrives, now + T.unit, expires) * self._arrived(before)
+            states.append(self._moved(step, state))
+        return rows_of(states[units - 1], self._kept)
+
+    def _arrived(self, before: arb_mat) -> arb_mat:
+        """Return the matrix until after an arrival, of what was sent at the start or before it."""
+        n = self.matrices[0].nrows()
+        x, rest = (rows_of(before, rows) for rows in (range(n), range(2 * n, before.nrows())))
+        return stack([x, self._arrived_x_c, rest])
+
+    def _moved(self, step: arb_mat, state: arb_mat) -> arb_mat:
+        """Return the state after a unit, in which the newest x is under way, too."""
+        after = step * state
+        if self._sent is None:
+            return after
+        return stack([self._loop * after, self._sent * state])
+
+    def _advance(self, begin: int, end: int, expires: int | None) -> arb_mat:
+        """Return the matrix between two times; a tick at the end is excluded, and a step at the start.
+
+        From ``expires`` on the controller's update is too old.
+        """
+        if expires is None or expires >= end:
+            return self._without_arrival(begin, end, False)
+        split = max(expires, begin)
+        late = self._without_arrival(split, end, True)
+        return late * self._without_arrival(begin, split, False) if split > begin else late
+
+    def _without_arrival(self, begin: int, end: int, is_late: bool) -> arb_mat:
+        cycle = lcm(self.times.step, self.times.tick)
+        begin, duration = begin % cycle, end - begin
+        key = begin, duration, is_late
+        if key not in self._advances:
+            cycles, rest = divmod(duration, cycle)
+            product = self._events(begin, begin + rest, is_late)
+            if cycles:
+                product = product * self._events(begin, begin + cycle, is_late) ** cycles
+            self._advances[key] = product
+        return self._advances[key]
+
+    def _events(self, begin: int, end: int, is_late: bool) -> arb_mat:
+        step, tick, phase = self.times.step, self.times.tick, self.times.phase
+        first = -(-(begin - phase) // tick) * tick + phase
+        events = [
+            *((t, self._step) for t in range((begin // step + 1) * step, end + 1, step)),
+            *((t, self._ticks[is_late]) for t in range(first, end, tick)),
+        ]
+        state, now = self._whole, begin
+        for t, change in sorted(events, key=lambda event: event[0]):  # steps stand before ticks
+            state, now = change * (self._flow(t - now) * state), t
+        return self._flow(end - now) * state
+
+    def _flow(self, duration: int) -> arb_mat:
+        if duration not in self._flows:
+            self._flows[duration] = (arb(self.times.seconds(duration)) * self._generator).exp()
+        return self._flows[duration]
 
 
 class Growth(NamedTuple):
-    """What is proven: bounds of the factor per period."""
+    """What is proven: bounds of the factor over the longest time between two transmissions."""
 
-    period: fmpq  # s
+    period: fmpq  # s, the longest time
+    shortest: fmpq  # s
     losses: int
     """Most consecutive losses of the patterns."""
     upper: arb | None
@@ -74,90 +375,40 @@ class Growth(NamedTuple):
     pattern: str
 
 
-def read_periodic_loop(resolved: Table) -> PeriodicLoop:
-    """Return the loop of a resolved scenario whose sensor is time-triggered.
+def read_periodic_loop(resolved: Table, longest: int | None = None) -> PeriodicLoop:
+    """Return the loop of a resolved scenario.
+
+    Args:
+        resolved: the scenario's tables, as tomllib returns them.
+        longest: most measurements between two transmissions; by default the trigger's.
 
     Raises:
         RefusedError: a key is not covered, is missing or has a wrong value.
     """
-    loop, schedule = read_loop(resolved, box=False, ideal=False), read_schedule(resolved)
-    if loop.observer is not None or loop.noise.ncols() or loop.sizes:
-        raise RefusedError("the growth is of a loop without observer, noise and disturbances")
-    if not loop.times.period > 0 or loop.times.least_period != loop.times.period:
-        raise RefusedError("trigger.policy: the sensor is not time-triggered")
-    if not schedule.is_whole:
-        raise RefusedError("plant.rate_hz, controller.rate_hz: their periods are no whole nanoseconds")
-    period_ns = int((loop.times.period * NS_PER_S).p)
-    step_ns, tick_ns = int(schedule.step), int(schedule.tick)
-    cycle_ns = lcm(step_ns, tick_ns)
-    slots = lcm(cycle_ns, period_ns) // period_ns
-    behind, _ = divmod(constant_delay_ns(resolved), period_ns)
-    if slots > _MOST_SLOTS or period_ns // min(step_ns, tick_ns) > _MOST_STEPS:
+    loop, schedule = read_linear_loop(resolved), read_schedule(resolved)
+    least, most = (max(ceil(Fraction(ns) / schedule.sample), 1) for ns in times_between_events(resolved))
+    if longest is not None:
+        least, most = longest if least == most else min(least, longest), longest
+    measurements = most if least == most else 1
+    unit, delay = schedule.sample * measurements, constant_delay_ns(resolved)
+    timeout, behind = update_timeout(resolved), int(delay // unit)
+    rest = delay - behind * unit
+    exact = (schedule.step, schedule.tick, schedule.exact_phase, unit, rest, timeout.after_ns or Fraction(0))
+    parts = lcm(*(t.denominator for t in exact))
+    *whole, after = (int(t * parts) for t in exact)
+    times = Times(*whole, behind, None if timeout.after_ns is None else after, timeout.holds_input, parts)
+    if times.slots > _MOST_SLOTS or lcm(times.step, times.tick) // min(times.step, times.tick) > _MOST_STEPS:
         raise RefusedError("the times of the loop repeat only after too many steps")
+    if most > _MOST_UNITS:
+        raise RefusedError("trigger: too many measurements between two events")
+    if behind and times.timeout is not None:
+        raise RefusedError("controller.update_timeout_s: not covered with updates on their way for a period")
     if 2 * (loop.n + loop.B.ncols()) + behind * loop.n > _MOST_SIZE:
         raise RefusedError("too many updates are on their way at once")
-    maps = _PeriodMaps(loop, schedule, period_ns, constant_delay_ns(resolved))
-    return PeriodicLoop(
-        tuple(maps.of(slot, delivered=True) for slot in range(slots)),
-        tuple(maps.of(slot, delivered=False) for slot in range(slots)),
-        loop.losses,
-        tuple(loss_windows(resolved)),
-        loop.times.period,
-    )
-
-
-class _PeriodMaps:
-    """The matrices of periods, with z = (x, x_c, u, w, older x)."""
-
-    def __init__(self, loop: Loop, schedule: Schedule, period_ns: int, delay_ns: int) -> None:
-        self._period_ns, (behind, self._rest_ns) = period_ns, divmod(delay_ns, period_ns)
-        self._schedule, n, m = schedule, loop.n, loop.B.ncols()
-        self._size = 2 * (n + m) + behind * n
-        at = [0, n, 2 * n, 2 * n + m, *(2 * (n + m) + i * n for i in range(behind + 1))]
-        whole = identity(self._size)
-        x, x_c, u, w, *older = (rows_of(whole, range(begin, end)) for begin, end in pairwise(at))
-        nothing = zeros(self._size - 2 * n, self._size)
-        self._generator = stack([loop.A * x + loop.B * u, loop.H * x_c, nothing])
-        sent = [x, *older]
-        self._changes = {
-            _STEP: stack([x, x_c, w, w, *older]),
-            _TICK: stack([x, x_c, u, loop.gain * x_c, *older]),
-        }
-        self._arrived = (arb(fmpq(delay_ns, NS_PER_S)) * loop.H).exp() * sent[-1]
-        self._x_c, self._older = range(n, 2 * n), sent[:-1]
-        self._flows: dict[int, arb_mat] = {}
-
-    def of(self, slot: int, *, delivered: bool) -> arb_mat:
-        """Return the matrix from one transmission to the next; ``delivered``: an update arrives between."""
-        begin = slot * self._period_ns
-        end, now, state = begin + self._period_ns, begin, identity(self._size)
-        for time, what in self._events(begin, end, delivered=delivered):
-            state = self._flow(time - now) * state
-            now = time
-            if what == _ARRIVAL:
-                rows = [rows_of(state, range(self._x_c.start)), self._arrived]
-                state = stack([*rows, rows_of(state, range(self._x_c.stop, self._size))])
-            else:
-                state = self._changes[what] * state
-        state = self._flow(end - now) * state
-        kept = rows_of(state, range(self._size - sum(part.nrows() for part in self._older)))
-        return stack([kept, *self._older])
-
-    def _events(self, begin: int, end: int, *, delivered: bool) -> list[tuple[int, int]]:
-        """Return what happens after a transmission and until the next one, in order of time."""
-        schedule = self._schedule
-        step, tick, phase = int(schedule.step), int(schedule.tick), int(schedule.phase)
-        steps = range((begin // step + 1) * step, end + 1, step)
-        ticks = range(-(-(begin - phase) // tick) * tick + phase, end, tick)
-        arrivals = [begin + self._rest_ns] if delivered else []
-        return sorted(
-            [*((t, _STEP) for t in steps), *((t, _ARRIVAL) for t in arrivals), *((t, _TICK) for t in ticks)]
-        )
-
-    def _flow(self, duration_ns: int) -> arb_mat:
-        if duration_ns not in self._flows:
-            self._flows[duration_ns] = (arb(fmpq(duration_ns, NS_PER_S)) * self._generator).exp()
-        return self._flows[duration_ns]
+    between = range(least // measurements, most // measurements + 1)
+    windows, recoveries = loss_rules(resolved)
+    guarantee = Guarantee(loop.losses, windows, recoveries)
+    return PeriodicLoop((loop.A, loop.B, loop.gain, loop.H), times, between, guarantee)
 
 
 def prove_growth(loop: PeriodicLoop, document: Mapping[str, object]) -> Growth:
@@ -165,82 +416,112 @@ def prove_growth(loop: PeriodicLoop, document: Mapping[str, object]) -> Growth:
 
     Raises:
         RejectedError: the first inequality that fails, or what is wrong with the document.
+        RefusedError: the guarantee allows too many patterns.
     """
     upper = lower = None
     pattern = ""
-    loop = loop._replace(losses=read_count(document, "losses", _LONGEST))
+    loop = loop.under(loop.guarantee._replace(losses=read_count(document, "losses", _LONGEST)))
+    longest = loop.between[-1]
     if "stable" in document:
-        upper = _prove_upper(loop, read_table(document, "stable"))
+        upper = _prove_upper(loop, read_table(document, "stable")) ** longest
     if "unstable" in document:
-        table = read_table(document, "unstable")
-        pattern = _pattern(loop, table)
-        lower = _lower(loop, pattern, table)
+        lower, pattern = _prove_lower(loop, read_table(document, "unstable"))
+        lower = lower**longest
     if upper is None and lower is None:
         raise RejectedError("growth: neither stable nor unstable")
-    return Growth(loop.period, loop.losses, upper, lower, pattern)
+    shortest = loop.seconds(loop.between[0])
+    return Growth(loop.seconds(longest), shortest, loop.guarantee.losses, upper, lower, pattern)
 
 
 def _prove_upper(loop: PeriodicLoop, table: Mapping[str, object]) -> arb:
-    """Prove that no pattern grows faster than by the table's factor."""
-    factor, words = read_number(table, "factor"), read_table(table, "words")
+    """Prove that no pattern grows faster than by the table's factor per unit."""
+    factor, memory = read_number(table, "factor"), read_count(table, "memory", _MOST_MEMORY)
     if not factor > 0:
         raise RejectedError("stable: factor: not above 0")
-    if "D" not in words or len(words) > _MOST_WORDS or any(set(word) - set("DL") for word in words):
-        raise RejectedError('stable: words: of letters D and L, "D" among them, and not too many')
-    size, slots = loop.lost[0].nrows(), len(loop.lost)
-    forms: dict[tuple[str, int], arb_mat] = {}
-    for word, stack_of in words.items():
-        if not isinstance(stack_of, list) or len(stack_of) != slots:
-            raise RejectedError(f"stable: {word[:_LONGEST]}: not one matrix for each slot")
-        for slot, rows in enumerate(stack_of):
-            forms[word, slot] = P = read_matrix({word: rows}, word, size)
-            if not is_positive(P - _DEFINITE * identity(size)):
-                raise RejectedError(f"stable: {word}: not positive definite")
-    for (word, slot), outcome in product(forms, "DL"):
-        if outcome == "L" and not loop.allows_loss(word):
-            continue
-        M = (loop.delivered if outcome == "D" else loop.lost)[slot]
-        following = forms[_following(words, word + outcome), (slot + 1) % slots]
-        if not is_positive(factor**2 * forms[word, slot] - transpose(M) * following * M):
-            raise RejectedError(f"stable: the inequality from {word} by {outcome} fails")
+    bursts = remembering(loop.bursts, memory)
+    leaving: dict[int, list[Burst]] = {}
+    for burst in bursts:
+        leaving.setdefault(burst.source, []).append(burst)
+    rows = table.get("forms")
+    if not isinstance(rows, list) or len(rows) != len(leaving):
+        raise RejectedError(f"stable: forms: not one matrix for each of {len(leaving)} nodes")
+    forms = [read_matrix({"forms": form}, "forms", loop.size) for form in rows]
+    if not all(is_positive(P - _DEFINITE * identity(loop.size)) for P in forms):
+        raise RejectedError("stable: forms: not positive definite")
+    products = 0
+    for node, P in enumerate(forms):
+        pending = [(node, identity(loop.size), 0, 1)]
+        while pending:
+            end, before, units, length = pending.pop()
+            for burst in leaving[end]:
+                Π, d = loop.matrix(burst) * before, units + burst.units
+                products += length > 1
+                if is_positive(factor ** (2 * d) * P - transpose(Π) * forms[burst.target] * Π):
+                    continue
+                if length == _LONGEST_PRODUCT or products > _MOST_PRODUCTS:
+                    raise RejectedError(f"stable: the inequality fails after {d} units from node {node}")
+                pending.append((burst.target, Π, d, length + 1))
     return factor
 
 
-def _following(words: Mapping[str, object], outcomes: str) -> str:
-    """Return the longest word that outcomes end with."""
-    for begin in range(len(outcomes)):
-        if outcomes[begin:] in words:
-            return outcomes[begin:]
-    raise RejectedError(f"stable: no word is at the end of {outcomes[:_LONGEST]}")
-
-
-def _pattern(loop: PeriodicLoop, table: Mapping[str, object]) -> str:
-    """Return the pattern of a table, which the guarantee allows if it is repeated."""
-    pattern = table.get("pattern")
-    if not isinstance(pattern, str) or not 0 < len(pattern) <= _LONGEST or set(pattern) - set("DL"):
-        raise RejectedError("unstable: pattern: not of letters D and L")
-    longest = max(loop.losses, *(window for _, window in loop.windows), 1)
-    repeated = pattern * (2 + longest // len(pattern))
-    for end in range(len(repeated)):
-        if repeated[end] == "L" and not loop.allows_loss(repeated[:end]):
-            raise RejectedError("unstable: pattern: the guarantee does not allow it")
-    return pattern
-
-
-def _lower(loop: PeriodicLoop, pattern: str, table: Mapping[str, object]) -> arb:
-    """Return a proven factor per period by which a pattern grows at least."""
+def _prove_lower(loop: PeriodicLoop, table: Mapping[str, object]) -> tuple[arb, str]:
+    """Return a proven factor per unit by which a pattern grows at least, and the pattern."""
     squarings = table.get("squarings")
     if isinstance(squarings, bool) or not isinstance(squarings, int) or not 0 <= squarings <= _MOST_SQUARINGS:
         raise RejectedError(f"unstable: squarings: not a whole number from 0 to {_MOST_SQUARINGS}")
-    slots = len(loop.lost)
-    periods = lcm(len(pattern), slots)
-    Π = identity(loop.lost[0].nrows())
-    for k in range(periods):
-        Π = (loop.delivered if pattern[k % len(pattern)] == "D" else loop.lost)[k % slots] * Π
+    pattern, intervals = _pattern(loop, table)
+    slots, slot, total = loop.times.slots, read_count(table, "slot", _MOST_SLOTS), sum(intervals)
+    bursts = [*_bursts_of(pattern, intervals)]
+    Π, units = identity(loop.size), 0
+    for _ in range(slots // gcd(slots, total)):
+        usable = loop.times.usable(bursts[-1])
+        for burst in bursts:
+            Π = loop.matrix(Burst(0, 0, (slot + units) % slots, usable, 0, burst)) * Π
+            usable, units = loop.times.usable(burst), units + burst
+    if "coordinates" in table:
+        T = read_rows(table, "coordinates")
+        if (T.nrows(), T.ncols()) != (loop.size, loop.size):
+            raise RejectedError("unstable: coordinates: not a square matrix of the right size")
+        try:
+            Π = T.inv() * Π * T
+        except ZeroDivisionError:
+            raise RejectedError("unstable: coordinates: singular") from None
     for _ in range(squarings):
         Π = Π * Π
     trace = sum((Π[i, i] for i in range(Π.nrows())), arb(0))
     least = arb(trace.abs_lower()) / Π.nrows()
     if not (least > 0 and least.is_finite()):
         raise RejectedError("unstable: the trace of the product is not above 0")
-    return arb((least.log() / (periods * 2**squarings)).exp())
+    text = pattern
+    if len(loop.between) > 1:
+        seconds = (float(arb(loop.seconds(k)).mid()) for k in intervals)
+        text = " ".join(f"{letter} ({s:.6g} s)" for letter, s in zip(pattern, seconds, strict=True))
+    return arb((least.log() / (units * 2**squarings)).exp()), text
+
+
+def _pattern(loop: PeriodicLoop, table: Mapping[str, object]) -> tuple[str, list[int]]:
+    """Return the pattern of a table, which the guarantee allows if it is repeated, and its intervals."""
+    pattern = table.get("pattern")
+    if not isinstance(pattern, str) or not 0 < len(pattern) <= _LONGEST or set(pattern) - set("DL"):
+        raise RejectedError("unstable: pattern: not of letters D and L")
+    intervals = table.get("intervals", [loop.between[0]] * len(pattern))
+    if not isinstance(intervals, list) or len(intervals) != len(pattern):
+        raise RejectedError("unstable: intervals: not one for each letter")
+    if not all(type(k) is int and k in loop.between for k in intervals):
+        raise RejectedError("unstable: intervals: not of the units that may be between two transmissions")
+    allowed = loop.guarantee
+    longest = max(allowed.losses, *(k for _, k in allowed.windows), *allowed.recoveries, 1)
+    state: State | None = allowed.start
+    for letter in pattern * (2 + longest // len(pattern)):
+        state = None if state is None else allowed.after(state, lost=letter == "L")
+    if state is None or "D" not in pattern:
+        raise RejectedError("unstable: pattern: the guarantee does not allow it")
+    if pattern[0] != "D":
+        raise RejectedError("unstable: pattern: does not begin with a delivery")
+    return pattern, intervals
+
+
+def _bursts_of(pattern: str, intervals: Sequence[int]) -> Iterator[int]:
+    """Yield the units from each delivery of a pattern to the next one."""
+    starts = [*(k for k, letter in enumerate(pattern) if letter == "D"), len(pattern)]
+    yield from (sum(intervals[begin:end]) for begin, end in pairwise(starts))

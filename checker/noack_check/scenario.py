@@ -509,8 +509,11 @@ def _require_stated_delay(resolved: Table) -> None:
         raise RefusedError("certificate.network_delay_s: the network delays each update by more")
 
 
-def constant_delay_ns(resolved: Table) -> int:
-    """Return the delay of all updates in the network; raise RefusedError if it may vary."""
+def constant_delay_ns(resolved: Table) -> Fraction:
+    """Return the delay of all updates in the network; raise RefusedError if it may vary.
+
+    In a loop whose periods are whole nanoseconds it is one, too.
+    """
     total = Fraction(0)
     for entry in _tables(_table(resolved, "network"), "network.impairments"):
         kind = entry.get("kind")
@@ -519,23 +522,84 @@ def constant_delay_ns(resolved: Table) -> int:
             total += fraction(delay_s) * NS_PER_S if delay_s else 0
         elif kind not in _WITHOUT_DELAY:
             raise RefusedError(f"network.impairments: {kind}: the delay of updates is not constant")
-    if total.denominator > 1:
+    if total.denominator > 1 and read_schedule(resolved).is_whole:
         raise RefusedError("network.impairments.delay_s: not a whole number of nanoseconds")
-    return int(total)
+    return total
 
 
-def loss_windows(resolved: Table) -> Sequence[tuple[int, int]]:
-    """Return for each rule of the guarantee its most losses, and in how many successive updates.
+def loss_rules(resolved: Table) -> tuple[tuple[tuple[int, int], ...], tuple[int, ...]]:
+    """Return the further rules of the guarantee.
+
+    They are the most losses of each window, with the number of its successive updates; and the least
+    numbers of deliveries between two bursts of losses.
 
     Raises:
         RefusedError: there is a rule of another kind.
     """
-    found = []
+    windows, recoveries = [], []
     for entry in _tables(_table(resolved, "network"), "network.constraints"):
-        if entry.get("kind") != "at_most":
+        if entry.get("kind") == "at_most":
+            windows.append(_window(entry))
+        elif entry.get("kind") == "recovery":
+            recoveries.append(_whole(entry, "network.constraints.deliveries"))
+        else:
             raise RefusedError(f"network.constraints: {entry.get('kind')}: not covered")
-        found.append(_window(entry))
-    return found
+    return tuple(windows), tuple(recoveries)
+
+
+class UpdateTimeout(NamedTuple):
+    """From which age on an update is not used, in ns, and what is then applied."""
+
+    after_ns: Fraction | None
+    holds_input: bool
+
+
+def update_timeout(resolved: Table) -> UpdateTimeout:
+    """Return what becomes of the input if no update arrives."""
+    controller = _table(resolved, "controller")
+    holds = controller.get("timeout_input") == "hold"
+    if "update_timeout_s" not in controller:
+        return UpdateTimeout(None, holds)
+    after_ns = fraction(_real(controller, "controller.update_timeout_s")) * NS_PER_S
+    if not after_ns > 0:
+        raise RefusedError("controller.update_timeout_s: not above 0")
+    return UpdateTimeout(Fraction(int(after_ns)) if read_schedule(resolved).is_whole else after_ns, holds)
+
+
+def times_between_events(resolved: Table) -> tuple[int, int]:
+    """Return the least and the largest time between two events, whatever is compared, in ns.
+
+    Raises:
+        RefusedError: there is no largest one.
+    """
+    trigger = _table(resolved, "trigger")
+    times, policy = _intervals(trigger), _combined(trigger)[-1].get("policy")
+    if not times.longest:
+        raise RefusedError("trigger.policy: the sensor is not time-triggered, and has no longest time")
+    least = times.shortest if policy in ("periodic", "self_triggered") else max(times.dwell, 1)
+    return min(least, times.longest), times.longest
+
+
+_OF_REST = ("setpoint", "safe_input", "update_timeout_s", "timeout_input")
+"""Settings of the controller that do not change by what the difference of two runs is multiplied."""
+
+
+def read_linear_loop(resolved: Table) -> Loop:
+    """Return the matrices and the most losses of a resolved scenario's loop, whatever its rule compares.
+
+    Raises:
+        RefusedError: a key is not covered, is missing or has a wrong value, or something disturbs the loop.
+    """
+    controller, plant = _table(resolved, "controller"), _table(resolved, "plant")
+    without_rest = {key: value for key, value in controller.items() if key not in _OF_REST}
+    any_rule = {"policy": "periodic", "period_s": 1.0}
+    on_time = {**_table(resolved, "certificate"), "late_periods": 0, "network_delay_s": 0.0}
+    resolved = {**resolved, "controller": without_rest, "trigger": any_rule, "certificate": on_time}
+    loop = read_loop(resolved, box=False, ideal=True)
+    if loop.observer is not None or loop.noise.ncols() or loop.sizes:
+        raise RefusedError("the growth is of a loop without observer, noise and disturbances")
+    _require_watchdog(_optional_table(plant, "watchdog"), read_schedule(resolved).times)
+    return loop
 
 
 def _require_watchdog(watchdog: Table, times: Times) -> None:

@@ -79,14 +79,20 @@ class Schedule:
         self.is_whole = self.step.denominator == self.tick.denominator == 1
         self._rounded = 0 if self.is_whole else _ROUNDED_NS
         self._late = late_periods * ceil(self.step)
+        self._phase = fraction(phase) * self.tick if phase else Fraction(0)
         if self.tick.denominator == 1:
             self.phase = round(phase * int(self.tick))
         else:
-            self.phase = ceil(fraction(phase) * self.tick) if phase else 0
+            self.phase = ceil(self._phase)
         if self.is_whole:
             self._in_flight = self._late + ceil(network_delay_s * NS_PER_S)
         else:
             self._in_flight = floor(late_periods * self.step) + nanoseconds(network_delay_s)
+
+    @property
+    def exact_phase(self) -> Fraction:
+        """The time of the first tick; without rounding, if the periods are no whole numbers."""
+        return Fraction(self.phase) if self.is_whole else self._phase
 
     @property
     def times(self) -> Times:

@@ -41,9 +41,9 @@ from noack.theory.certificates.region import RegionScope
 from noack.theory.certificates.scenario_certificates import box_scope, outside_box, own_plant_scope
 from noack.theory.certificates.trigger_weight import choose_weight
 from noack.theory.coverage import NOT_COVERED, refusals, require_certifiable, without_loads
-from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
 from noack.theory.witnesses.effort import MOST_WORK
+from noack.theory.witnesses.loss_margin import LossMargin, Stability
 from noack.trigger_policies.decaying import DecayingSettings
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
@@ -376,7 +376,7 @@ class Certificates:
                 for bound in self.output_bounds(certificate)
             ],
             "unproven": [each._asdict() for each in self.unproven],
-            "stability": None if self.stability is None else self.stability._asdict(),
+            "stability": None if self.stability is None else self.stability.to_json(),
             "schedule": {
                 f"{name}_s": getattr(self.scheduled, f"{name}_s") for name in ("sampling", "delay", "hold")
             },

@@ -1,4 +1,4 @@
-"""What noack-check proves of the growth of a time-triggered loop under every pattern of losses."""
+"""What noack-check has proven of the growth of a time-triggered loop under every pattern of losses."""
 
 import json
 from collections.abc import Sequence
@@ -6,11 +6,8 @@ from typing import NamedTuple
 
 from cosim.analysis.witnesses import resolved_content
 from noack.scenario.scenario import Scenario
-from noack.theory.margins.loss_margin import Stability
-from noack.theory.witnesses.effort import NoWitnessError
-from noack.theory.witnesses.growth import stable_document, unstable_document
-from noack_check.growth import read_periodic_loop
-from noack_check.keys import RefusedError
+from noack.theory.witnesses.loss_margin import Stability
+from noack_check.growth import prove_growth, read_periodic_loop
 from noack_check.sentences import growth_sentences
 
 _PLACE = {"statement": "growth", "plants": "own", "conditions": "schedule"}
@@ -23,47 +20,29 @@ class GrowthProof(NamedTuple):
     """As `noack check --resolved` prints it."""
     proven: Sequence[str]
     documents: Sequence[dict[str, object]]
-    reason: str
-    """Why something is computed only; empty: all is proven."""
 
     @property
     def lines(self) -> list[str]:
-        """What is proven, and what is not, a line each."""
-        lines = [f"proved by noack-check: {sentence}" for sentence in self.proven]
-        return [*lines, *([f"computed, not checked by noack-check: {self.reason}"] if self.reason else [])]
+        """What is proven, a line each."""
+        return [f"proved by noack-check: {sentence}" for sentence in self.proven]
 
     def file_text(self) -> str:
         """Return the file that ``noack-check`` reads."""
         return json.dumps({"scenario": self.scenario, "statements": self.documents}, allow_nan=False)
 
 
-def prove_growths(resolved: Scenario, found: Sequence[tuple[int, Stability]]) -> GrowthProof:
-    """Prove the growth for the most losses with which the loop is stable, and the one that destabilises it.
+def growth_proof(resolved: Scenario, found: Sequence[Stability]) -> GrowthProof:
+    """Return the proofs for the most losses with which the loop is stable, and the one that destabilises it.
 
     Args:
         resolved: the scenario.
-        found: numbers of consecutive losses, in order, with what was computed for them.
+        found: what is known for 0, 1, … consecutive losses.
     """
     content = resolved_content(resolved, resolved.certificate.late_periods)
-    proven: list[str] = []
-    documents: list[dict[str, object]] = []
-    reasons: list[str] = []
-    try:
-        loop = read_periodic_loop(content)
-    except RefusedError as error:
-        return GrowthProof(content, (), (), str(error))
-    stable = [(losses, growth) for losses, growth in found if growth.verdict == "stable"][-1:]
-    unstable = [(losses, growth) for losses, growth in found if growth.verdict == "destabilised"][:1]
-    for losses, growth in (*stable, *unstable):
-        limited = loop._replace(losses=losses)
-        try:
-            if growth.verdict == "stable":
-                document, what = stable_document(limited, growth.lower)
-            else:
-                document, what = unstable_document(limited, growth.pattern)
-        except NoWitnessError as error:
-            reasons.append(f"at most {losses} consecutive losses: {error}")
-        else:
-            documents.append({**_PLACE, **document})
-            proven += growth_sentences(what)
-    return GrowthProof(content, proven, documents, "; ".join(reasons))
+    loop, proven, documents = read_periodic_loop(content), list[str](), list[dict[str, object]]()
+    stable = [growth.documents["stable"] for growth in found if growth.verdict == "stable"][-1:]
+    unstable = [growth.documents["unstable"] for growth in found if growth.verdict == "destabilised"][:1]
+    for document in (*stable, *unstable):
+        documents.append({**_PLACE, **document})
+        proven += growth_sentences(prove_growth(loop, document))
+    return GrowthProof(content, proven, documents)

@@ -4,27 +4,27 @@ Other guarantees than the scenario's own one are compared with it, too: their gr
 them imply others.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 from typing import NamedTuple
 
 from cosim.analysis.certificates import CertificateAnswer, answer_for
-from cosim.analysis.growth_proof import GrowthProof, prove_growths
+from cosim.analysis.growth_proof import GrowthProof, growth_proof
 from netem.tc_words import guarantee_words, settings_of
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_checks import real_number, whole_number
-from noack.core.number_format import at_least, at_most, duration
+from noack.core.number_format import at_least, at_most
 from noack.guarantee.loss_guarantee import LossGuarantee, OutcomePattern, find_counterexample, outcome_letters
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
 from noack.runtime.command_line import StopRequestError
 from noack.scenario.scenario import Scenario
-from noack.theory.margins.joint_spectral_radius import ACCURACY
-from noack.theory.margins.loss_margin import LossMargin, Stability, capped, uncapped
 from noack.theory.random_losses.mean_square_growth import MeanSquareGrowth, growth_without_guarantee
+from noack.theory.witnesses.growth import ACCURACY
+from noack.theory.witnesses.loss_margin import LossMargin, Stability, capped, uncapped
 
 MOST_M = 16
 """Largest M that is examined by default."""
@@ -122,16 +122,11 @@ def _implication(meaning: str, implied: str, beyond: OutcomePattern) -> str:
 _NOT_COMPARED = GuaranteeComparison()
 
 
-def undecided_text(stability: Stability, effort: float) -> str:
-    """Return the bounds of an undecided growth, and what more time would give."""
-    lower, upper, needed_effort = stability.lower, stability.upper, max(stability.needed_effort, 2 * effort)
-    text = (
-        f"growth between {at_least(lower, 6)} and {at_most(upper, 6)}, gap {upper - lower:.2g}; if it is the "
-    )
-    if not needed_effort < _LARGEST_EFFORT:
-        return f"{text}lower bound, no effort up to {_LARGEST_EFFORT:g} is estimated to prove it"
-    time_text = duration(stability.took_s * needed_effort / effort)
-    return f"{text}lower bound, --effort {needed_effort:.2g} is estimated to prove it, in about {time_text}"
+def undecided_text(stability: Stability) -> str:
+    """Return the bounds of an undecided growth."""
+    lower, upper = stability.lower, stability.upper
+    gap = f"gap {upper - lower:.2g}; a larger --effort may decide it"
+    return f"growth between {at_least(lower, 6)} and {at_most(upper, 6)}, {gap}"
 
 
 class LossCap(NamedTuple):
@@ -180,7 +175,7 @@ class PeriodLimit(NamedTuple):
             return (
                 f"proven stable for every loss pattern with {apart} {self.stable_s:g} s, the longest examined"
             )
-        longer = f"{apart} {self.unstable_s:g} s: undecided, {undecided_text(self.stability, 1.0)}"
+        longer = f"{apart} {self.unstable_s:g} s: undecided, {undecided_text(self.stability)}"
         if self.stability.verdict == "destabilised":
             longer = f"{apart} {self.unstable_s:g} s: this pattern destabilises: {self.stability.text}"
         if self.stable_s is None:
@@ -256,12 +251,12 @@ class MarginResult:
         elif stable_m is not None:
             parts = [f"proven stable for every loss pattern with M ≤ {stable_m}"]
         parts += [
-            f"{guarantee.meaning}: undecided, {undecided_text(guarantee.stability, self.effort)}"
+            f"{guarantee.meaning}: undecided, {undecided_text(guarantee.stability)}"
             for guarantee in self.compared.guarantees
             if guarantee.stability.verdict == "undecided"
         ]
         parts += [
-            f"M = {cap.m} is undecided: {undecided_text(cap.stability, self.effort)}"
+            f"M = {cap.m} is undecided: {undecided_text(cap.stability)}"
             for cap in self.caps  # of fewer losses all are stable
             if cap.stability.verdict == "undecided" and cap.m > (stable_m or 0)
         ]
@@ -296,33 +291,22 @@ class MarginResult:
         if (limit := self.period) is not None:
             period = limit._asdict() | {"text": limit.text}
             del period["stability"]
-            period["found"] = None if limit.stability is None else stability_document(limit.stability)
+            period["found"] = None if limit.stability is None else limit.stability.to_json()
         growth = self.without_guarantee
         return vars(self) | {
             "verdict": self.verdict,
             "stable_m": self.stable_m,
-            "caps": [{"m": cap.m, **stability_document(cap.stability)} for cap in self.caps],
+            "caps": [{"m": cap.m, **cap.stability.to_json()} for cap in self.caps],
             "compared": [
-                {"guarantee": guarantee.meaning, **stability_document(guarantee.stability)}
+                {"guarantee": guarantee.meaning, **guarantee.stability.to_json()}
                 for guarantee in self.compared.guarantees
             ],
             "relations": self.compared.relations,
             "period": period,
             "without_guarantee": growth if isinstance(growth, str) else growth._asdict(),
             "certificate": None if self.certificate is None else self.certificate._asdict(),
-            "proof": None
-            if self.proof is None
-            else {"proven": self.proof.proven, "reason": self.proof.reason},
+            "proof": None if self.proof is None else {"proven": self.proof.proven},
         }
-
-
-def stability_document(stability: Stability) -> dict[str, object]:
-    """Return what is known of a guarantee as JSON; the same in each run."""
-    needed = stability.needed_effort if math.isfinite(stability.needed_effort) else None
-    known = {"pattern": stability.text, "verdict": stability.verdict, "needed_effort": needed}
-    document = stability._asdict() | known
-    document.pop("took_s")
-    return document
 
 
 def find_margin(
@@ -381,7 +365,7 @@ def find_margin(
                 break
         missing.remove(_CAPS)
         progress("a proof for noack-check")
-        proof = prove_growths(resolved, [(cap.m - 1, cap.stability) for cap in caps])
+        proof = growth_proof(resolved, [cap.stability for cap in caps])
         if others_read:
             compared = compare_guarantees([network.guarantee, *others_read], examine)
             missing.remove(_OTHERS)
@@ -405,7 +389,7 @@ def find_margin(
         guarantee=network.guarantee.meaning,
         shortest_s=margin.seconds(margin.shortest),
         period_s=margin.seconds(margin.longest),
-        delay_s=margin.loop.times.seconds(margin.loop.times.whole_delay),
+        delay_s=float(margin.delay_ns / NS_PER_S),
         caps=_with_implied_bounds(caps),
         every_m=every_m,
         period=limit,
@@ -463,9 +447,9 @@ def find_longest_period(resolved: Scenario, progress: MarginProgress = lambda te
 
     own_margin = LossMargin(resolved)
     is_longest = own_margin.shortest < own_margin.longest
-    times, measurement_ns = own_margin.loop.times, resolved.timing.measurement_period.exact
+    measurement_ns = resolved.timing.measurement_period.exact
     longest = max(int(resolved.timing.horizon_ns / measurement_ns), own_margin.longest)
-    shortest = min(int(times.whole_delay / (times.parts * measurement_ns)) + 1, own_margin.longest)
+    shortest = min(int(own_margin.delay_ns / measurement_ns) + 1, own_margin.longest)
     if is_longest:  # below the policy's least time, all times between updates would be equal
         shortest = max(shortest, own_margin.shortest)
     stable, unstable = 0, 0

@@ -9,7 +9,7 @@ from cosim.analysis.mean_cost import MeanCost, find_mean_cost
 from cosim.api.scenarios import Source, load
 from cosim.live.monitoring.progress import work_bar
 from noack.scenario.resolution import resolve
-from noack.theory.margins.joint_spectral_radius import ACCURACY
+from noack.theory.witnesses.growth import ACCURACY
 
 
 def certify(

@@ -24,7 +24,7 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate, enve
 from noack.theory.certificates.conditions import BOX, REGION
 from noack.theory.certificates.network_limits import MOST_S
 from noack.theory.certificates.scenario_certificates import outside_box
-from noack.theory.margins.loss_margin import Stability
+from noack.theory.witnesses.loss_margin import Stability
 
 _MOST_BOUNDS = 6
 """Outputs whose bounds are printed without --verbose."""

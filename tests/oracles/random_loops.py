@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from flint import arb, arb_mat
 from scipy.linalg import block_diag, solve_continuous_are
 
 from cosim.analysis.margin_search import read_guarantee
@@ -11,9 +12,10 @@ from noack.core.linear_systems import Matrix
 from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
-from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
-from noack.theory.margins.loss_margin import LossMargin
-from noack.theory.margins.switched_system import SwitchedSystem, find_cycle
+from noack.theory.time_triggered.graph import Graph
+from noack.theory.witnesses.coordinates import floats
+from noack.theory.witnesses.loss_margin import LossMargin, checked_guarantee
+from noack_check.growth import Burst, PeriodicLoop
 
 GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
 
@@ -76,18 +78,33 @@ def random_loop(seed: int) -> RandomLoop:
     # The growth of the worst pattern, scaled to a distance from 1.
     distance = 10 ** rng.uniform(-3, -1)
     wanted = 1 + distance if rng.random() < 0.25 else 1 - distance
-    scale = wanted / _fastest(margin, guarantee)
-    original = margin.maps
-
-    def scaled(slot: int, usable: int, losses: int) -> IntervalMatrix:
-        matrix = original(slot, usable, losses)
-        return matrix @ exactly(np.eye(len(matrix.middle[0])) * scale ** (losses + 1))
-
-    margin.maps = scaled
+    scale = wanted / _fastest(margin.loop.under(checked_guarantee(guarantee)))
+    margin.loop = ScaledLoop.of(margin.loop, scale)
     return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[number]}", wanted, scale)
 
 
-def _fastest(margin: LossMargin, guarantee: LossGuarantee) -> float:
-    system = SwitchedSystem.of(margin.edges(margin.bursts(guarantee)))
-    parts = [system.at(numbers).balanced() for numbers in system.graph.strongly_connected()]
-    return max(find_cycle(part, 30, 200).growth for part in parts)
+class ScaledLoop(PeriodicLoop):
+    """A loop whose states are multiplied by a factor, too, with each unit of time."""
+
+    scale: float
+
+    @classmethod
+    def of(cls, loop: PeriodicLoop, scale: float) -> "ScaledLoop":
+        """Return a loop with a factor."""
+        scaled = cls(loop.matrices, loop.times, loop.between, loop.guarantee)
+        scaled.scale = scale
+        return scaled
+
+    def matrix(self, burst: Burst) -> arb_mat:
+        """Return the matrix of a burst."""
+        return arb(self.scale) ** burst.units * super().matrix(burst)
+
+
+def _fastest(loop: PeriodicLoop) -> float:
+    """Return the growth of the fastest cycle that a search finds."""
+    matrices = np.array([floats(loop.matrix(burst)) for burst in loop.bursts])
+    ends = ((burst.source, burst.target, burst.units) for burst in loop.bursts)
+    graph = Graph(*(np.array(column) for column in zip(*ends, strict=True)))
+    T = graph.balancing(matrices)
+    balanced = T[graph.targets] @ matrices @ np.linalg.inv(T)[graph.sources]
+    return float(np.exp(graph.fastest_cycle(balanced, 30, 200)[0]))

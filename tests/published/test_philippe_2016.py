@@ -7,9 +7,7 @@ Either of two gains may fail, but not twice in succession; both fail only after 
 import numpy as np
 import pytest
 
-from noack.theory.margins.exact_matrices import exactly
-from noack.theory.margins.joint_spectral_radius import joint_spectral_radius
-from noack.theory.margins.switched_system import Edge
+from tests.oracles.switched_loops import SwitchedLoop
 
 A, B, K = np.array([[0.94, 0.56], [0.14, 0.46]]), np.array([[0.0], [1.0]]), np.array([-0.49, 0.27])
 WORKS = {1: [1, 1], 2: [0, 1], 3: [1, 0], 4: [0, 0]}
@@ -20,11 +18,10 @@ CYCLE = [2, 1, 2, 3, 1, 1, 1, 1]
 
 
 def test_growth_and_worst_cycle_are_the_published_ones() -> None:
-    edges = []
-    for source, target, mode in (map(int, str(number)) for number in EDGES):
-        edges.append(Edge(source, target, exactly(A + B * (K * WORKS[mode]))))
-    radius = joint_spectral_radius(edges, accuracy=1e-11)
-    assert radius.lower == pytest.approx(0.9748171979372, abs=5e-13)
-    assert radius.upper == pytest.approx(0.9748171979372, abs=5e-11)
-    modes = [EDGES[number] % 10 for number in radius.cycle]
+    edges = [tuple(int(digit) for digit in str(number)) for number in EDGES]
+    loop = SwitchedLoop([(v - 1, w - 1, A + B * (K * WORKS[mode])) for v, w, mode in edges])
+    assert 0.9748171979372 <= loop.upper(5e-3) < 0.98
+    growth, cycle = loop.fastest_cycle()
+    assert growth == pytest.approx(0.9748171979372, abs=5e-13)
+    modes = [EDGES[number] % 10 for number in cycle]
     assert CYCLE in [modes[i:] + modes[:i] for i in range(len(modes))]

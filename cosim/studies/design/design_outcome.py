@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.margin_search import stability_document
 from cosim.output.curves import DASHED
 from cosim.output.figures import palette
 from cosim.output.figures.axes_parts import draw_line, rgb, whole_numbers
@@ -134,7 +133,7 @@ def _loop_result(search: NetworkSearch, loop: CertifiedLoop) -> LoopResult:
     document: dict[str, object] = {"certified": loop.m or None, "cost": loop.cost}
     document |= {"transmitted": share, "K": loop.K}
     for name, stability in (("stability", proven), ("beyond", loop.beyond)):
-        document[name] = stability and stability_document(stability)
+        document[name] = stability and stability.to_json()
     return LoopResult(reach, cells, document)
 
 

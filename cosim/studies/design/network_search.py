@@ -28,9 +28,10 @@ from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows, rows_of
 from noack.theory.coverage import require_exact
-from noack.theory.margins.loss_margin import LossMargin, Stability, capped, list_bursts, uncapped
-from noack.theory.margins.scenario_times import without_timeout
+from noack.theory.time_triggered.scenario_times import loop_times, without_timeout
+from noack.theory.witnesses.loss_margin import LossMargin, Stability, capped, checked_guarantee, uncapped
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
+from noack_check.growth import list_bursts
 
 COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
 """Factors of R of the regulators that the search begins with."""
@@ -115,8 +116,9 @@ class NetworkSearch:
         self.request, self.scenario = request, time_triggered(scenario, request.period_s)
         resolved = resolve(self.scenario)
         self.plant, margin = loop_of(resolved), LossMargin(resolved)
-        self.measurements, self._times = margin.longest, margin.loop.times
+        self.measurements, self._loop = margin.longest, margin.loop
         """From an update to the next one."""
+        self._times = loop_times(resolved, margin.longest)
         self.period_s = margin.seconds(margin.longest)
         if margin.shortest < margin.longest:
             raise CallerError(
@@ -149,7 +151,8 @@ class NetworkSearch:
 
     def _new_graph(self, m: int) -> PatternGraph:
         """Return the loss patterns for an M, which keep those that were the worst."""
-        return PatternGraph(list_bursts(self.guarantee(m), self._times))
+        guarantee = checked_guarantee(self.guarantee(m))
+        return PatternGraph(list_bursts(guarantee, self._loop.times, self._loop.between))
 
     def growth(self, K: MatrixRows, m: int) -> float:
         """Return a lower bound of the logarithm of the growth per period."""

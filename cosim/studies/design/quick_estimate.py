@@ -2,7 +2,7 @@
 
 A search tries thousands of gains. For each, the loop's maps are computed in double precision, and
 short cycles give a lower bound of the growth. It excludes gains; it proves nothing.
-:mod:`noack.theory.margins` has the exact maps, and decides about what is left.
+:mod:`noack.theory.witnesses.growth` decides about what is left.
 """
 
 import math
@@ -16,9 +16,9 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.stacked_norms import Stack
-from noack.theory.margins.loss_margin import Burst
-from noack.theory.margins.switched_system import Graph, spectral_radii
-from noack.theory.margins.time_triggered_loop import LoopTimes, Timeline
+from noack.theory.time_triggered.graph import Graph, spectral_radii
+from noack.theory.time_triggered.time_triggered_loop import LoopTimes, Timeline
+from noack_check.growth import Burst
 
 _FURTHER_EDGES, _MOST_EDGES = 5, 40
 """Edges of the longest cycles, beyond the number of nodes, and in all."""
@@ -143,7 +143,7 @@ class PatternGraph:
 
     def __init__(self, bursts: Sequence[Burst]) -> None:
         self.bursts = bursts
-        ends = (np.array(part) for part in zip(*((b.source, b.target, b.steps) for b in bursts), strict=True))
+        ends = (np.array(part) for part in zip(*((b.source, b.target, b.units) for b in bursts), strict=True))
         self._graph = Graph(*ends)
         self._most_edges = min(_FURTHER_EDGES + self._graph.nodes, _MOST_EDGES)
         self._cycles: dict[tuple[int, ...], None] = {}

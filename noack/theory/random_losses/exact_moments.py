@@ -41,9 +41,6 @@ from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.coverage import refusal
-from noack.theory.margins.exact_matrices import exactly
-from noack.theory.margins.scenario_times import intervals, loop_times, require_idle_watchdog
-from noack.theory.margins.time_triggered_loop import LoopTimes, Timeline, repeated
 from noack.theory.random_losses.mean_square_growth import (
     from_triangles,
     mean_square_growth,
@@ -52,6 +49,9 @@ from noack.theory.random_losses.mean_square_growth import (
     solve_resolvent,
     triangles,
 )
+from noack.theory.time_triggered.exact_matrices import exactly
+from noack.theory.time_triggered.scenario_times import intervals, loop_times, require_idle_watchdog
+from noack.theory.time_triggered.time_triggered_loop import LoopTimes, Timeline, repeated
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 """Of Gauss's formula on [−1, 1]."""

@@ -28,10 +28,10 @@ from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.contraction import EPSILON
 from noack.theory.bounds.stacked_norms import Stack
-from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
-from noack.theory.margins.scenario_times import intervals, loop_times
-from noack.theory.margins.switched_system import Graph
-from noack.theory.margins.time_triggered_loop import NEVER, LoopTimes, TimeTriggeredLoop
+from noack.theory.time_triggered.exact_matrices import IntervalMatrix, exactly, inverse
+from noack.theory.time_triggered.graph import Graph
+from noack.theory.time_triggered.scenario_times import intervals, loop_times
+from noack.theory.time_triggered.time_triggered_loop import NEVER, LoopTimes, TimeTriggeredLoop
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array  # slow to import

@@ -13,7 +13,7 @@ from cosim.cli.options import load_scenario
 from noack.core.linear_systems import discretise
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.margins.loss_margin import LossMargin, Stability
+from noack.theory.witnesses.loss_margin import LossMargin, Stability
 from tests.helpers.command_line import invoke
 
 HELD = {

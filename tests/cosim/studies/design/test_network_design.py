@@ -14,7 +14,7 @@ from cosim.studies.design.design_outcome import DesignOutcome, network_outcome
 from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.margins.loss_margin import LossMargin
+from noack.theory.witnesses.loss_margin import LossMargin
 from tests.helpers.approved import compare_lines
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import shipped

@@ -7,7 +7,8 @@ from cosim.analysis.mean_cost import CostUnder, find_mean_cost
 from cosim.studies.design.network_search import DesignRequest, NetworkSearch
 from cosim.studies.design.quick_estimate import PatternGraph
 from noack.scenario.resolution import resolve
-from noack.theory.margins.loss_margin import LossMargin
+from noack.theory.witnesses.coordinates import floats
+from noack.theory.witnesses.loss_margin import LossMargin, checked_guarantee
 from tests.helpers.shipped import shipped
 
 
@@ -23,9 +24,10 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         given = shipped("double_integrator", *more)
         search = NetworkSearch(given, DesignRequest(period_s=0.31))
         exact = LossMargin(resolve(search.scenario))
-        bursts = exact.bursts(search.guarantee(5))
+        loop = exact.loop.under(checked_guarantee(search.guarantee(5)))
+        bursts = loop.bursts
         quick = search.quick_loop(search.given_gain).maps(bursts)
-        maps = np.array([exact.maps(burst.slot, burst.usable, burst.losses).middle for burst in bursts])
+        maps = np.array([floats(loop.matrix(burst)) for burst in bursts])
         if not more or more == timeouts[0]:
             np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
         stability = exact.coarse_bounds(search.guarantee(5))

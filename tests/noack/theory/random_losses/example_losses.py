@@ -8,8 +8,8 @@ from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.margins.exact_matrices import exactly
 from noack.theory.random_losses import mean_square_growth as mean_square_module
+from noack.theory.time_triggered.exact_matrices import exactly
 
 BURSTY = LossProcess(np.array([0.8, 0.2]), np.array([[0.9, 0.1], [0.4, 0.6]]), np.array([0.05, 0.8]))
 

@@ -12,9 +12,6 @@ from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of
-from noack.theory.margins.exact_matrices import exactly
-from noack.theory.margins.scenario_times import loop_times
-from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop, repeated
 from noack.theory.random_losses.exact_moments import (
     LoopMoments,
     LoopPeriods,
@@ -24,6 +21,9 @@ from noack.theory.random_losses.exact_moments import (
     propagation,
     start_of,
 )
+from noack.theory.time_triggered.exact_matrices import exactly
+from noack.theory.time_triggered.scenario_times import loop_times
+from noack.theory.time_triggered.time_triggered_loop import TimeTriggeredLoop, repeated
 from tests.noack.theory.random_losses.example_losses import BURSTS, NOISE, scenario
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from noack.impairments.loss_prediction import LossProcess
 from noack.impairments.markov_chain import Array, NotPredictableError
-from noack.theory.margins.exact_matrices import IntervalMatrix
 from noack.theory.random_losses.mean_square_growth import PeriodMaps
+from noack.theory.time_triggered.exact_matrices import IntervalMatrix
 from tests.noack.theory.random_losses.example_losses import BURSTY, independent, mean_square_growth, unlimited
 
 

@@ -4,10 +4,9 @@ The loop and its patterns are those of ``tests/oracles/time_triggered_loops.py``
 lower bound is repeated from the first update on.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
@@ -15,11 +14,9 @@ from noack.core.linear_systems import spectral_abscissa
 from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.margins import loss_margin
-from noack.theory.margins.joint_spectral_radius import JointSpectralRadius
-from noack.theory.margins.loss_margin import LossMargin, Stability, capped
-from noack.theory.margins.scenario_times import intervals, without_timeout
-from noack.theory.margins.switched_system import Edge, SwitchedSystem, find_cycle
+from noack.theory.time_triggered.scenario_times import without_timeout
+from noack.theory.witnesses.coordinates import floats
+from noack.theory.witnesses.loss_margin import LossMargin, Stability, capped, checked_guarantee
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.policies import scenario_of
 from tests.noack.theory.certificates.certificate_kinds.shares import Case, drawn, shares_of
@@ -105,9 +102,10 @@ def _used_forever(loop: LoopMaps) -> Stability:
 
 
 def _soon(loop: LoopMaps) -> Stability:
-    shortest, longest = intervals(loop.resolved)
-    with patch.object(loss_margin, "intervals", lambda resolved: (shortest, shortest)):
-        stability = bounded(loop.resolved)
+    margin = LossMargin(loop.resolved)
+    shortest, longest = margin.loop.between[0], margin.loop.between[-1]
+    margin.loop.between = range(shortest, shortest + 1)
+    stability = margin.stability(None, _ACCURACY, decide=False)
     return stability._replace(upper=stability.upper ** (longest / shortest), pattern=())
 
 
@@ -117,14 +115,14 @@ def _late_pattern(loop: LoopMaps) -> Stability:
 
 
 def _each_burst_alone(loop: LoopMaps) -> Stability:
-    true = loss_margin.joint_spectral_radius
-
-    def wrong(edges: Sequence[Edge], **options: Any) -> JointSpectralRadius:
-        fastest = find_cycle(SwitchedSystem.of(edges), 1, len(edges)).growth
-        return true(edges, **options)._replace(upper=fastest)
-
-    with patch.object(loss_margin, "joint_spectral_radius", wrong):
-        return bounded(loop.resolved)
+    margin = LossMargin(loop.resolved)
+    checked = margin.loop.under(checked_guarantee(margin.guarantee))
+    growths = (
+        np.abs(np.linalg.eigvals(floats(checked.matrix(burst)))).max() ** (checked.between[-1] / burst.units)
+        for burst in checked.bursts
+        if burst.source == burst.target
+    )
+    return bounded(loop.resolved)._replace(upper=float(max(growths)))
 
 
 def growth_shares(loop: LoopMaps, stability: Stability, rng: np.random.Generator) -> Observed:

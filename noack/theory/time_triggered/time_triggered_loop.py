@@ -1,4 +1,4 @@
-"""The loop of a time-triggered sensor between two deliveries, as a linear map without rounding.
+"""The loop of a time-triggered sensor from one transmission to the next, as a linear map without rounding.
 
 Every T the sensor transmits x. The loop is that of the processes, with no step late:
 
@@ -8,13 +8,6 @@ Every T the sensor transmits x. The loop is that of the processes, with no step 
 * a tick at least Θ after the time of the newest update sends w = 0 instead, or w once more;
 * between updates ẋ_c = H x_c; an update of time t_k that arrives at t_k + d sets x_c to
   e^{Hd} x(t_k). At one time, the order is: step of the plant, transmission, arrival, tick.
-
-A delivered update removes all knowledge of older ones. So the state of the loop just after the
-delivery, if d = 0, is z = (x, u): x_c = x and w = u there. If 0 < d < T, z is the state at the
-time of the transmission, (x, x_c); there u is K e^{−Hδ} x_c for the last tick, δ ago, unless there
-may be no tick since the last arrival, or Θ is finite; then z = (x, x_c, u), and the map depends on
-how much longer x_c may be used. If d ≥ T, z has, too, the x of the ⌊d/T⌋ transmissions before, whose
-updates are on their way, and "delivered" is said at the transmission before which an update arrives.
 """
 
 import math
@@ -26,7 +19,7 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, balancing_exponents
-from noack.theory.margins.exact_matrices import FixedPointMatrix, IntervalMatrix, exponential, fixed, stacked
+from noack.theory.time_triggered.exact_matrices import IntervalMatrix, exponential, fixed, stacked
 
 NEVER = 10**60
 """Later than all times, in any unit."""
@@ -35,7 +28,7 @@ NEVER = 10**60
 class LoopTimes(NamedTuple):
     """The schedule of a time-triggered loop, in parts of a nanosecond: no period is rounded.
 
-    :func:`noack.theory.margins.scenario_times.loop_times` derives it from a scenario's ``Timing``. All
+    :func:`noack.theory.time_triggered.scenario_times.loop_times` derives it from a scenario's ``Timing``. All
     its times are whole numbers, so that what happens at the same time does so here, too.
     """
 
@@ -175,47 +168,22 @@ class TimeTriggeredLoop:
         generator[:n, :n], generator[n : 2 * n, n : 2 * n] = A, H
         generator[:n, 2 * n : 2 * n + m] = B
         x, x_c, u, w = np.split(np.eye(size), [n, 2 * n, 2 * n + m])
-        self._x, self._x_c, self._K = slice(n), slice(n, 2 * n), fixed(K)
-        self._inputs, self._loop = slice(2 * n, size), slice(size)
+        self._x, self._inputs, self._loop = slice(n), slice(2 * n, size), slice(size)
         self._older = [slice(size + i * n, size + (i + 1) * n) for i in range(times.behind)]
         """x of the transmissions before, the newest one first."""
         without_update = w if times.holds_input else 0 * w
         occurrences = [(x, x_c, w, w), (x, x_c, u, K @ x_c), (x, x_c, u, without_update)]
-        whole = size + n * times.behind
-        self._start = fixed(np.eye(whole))
+        self._start = fixed(np.eye(size + n * times.behind))
         self._between = Timeline(
             times,
             lambda dt: exponential(generator, dt, times.parts),
             *(fixed(np.vstack(rows)) for rows in occurrences),
         ).between
-        self._states: dict[tuple[int, int], list[FixedPointMatrix]] = {}
-        """States by slot and use of x_c after 1, 2, … periods, as functions of z."""
-        since = [times.since_tick(k * times.period) for k in range(times.slots)]
-        follows = max(since) <= times.period - times.delay and times.timeout == NEVER
-        self._has_new_x_c = times.whole_delay == 0
-        if self._has_new_x_c:
-            self._kept = [*range(n), *range(2 * n, 2 * n + m)]  # x, u
-        else:  # x, x_c and perhaps u, and what is on its way
-            self._kept = [*range(2 * n if follows else 2 * n + m), *range(size, whole)]
-        self._follows, self.dimension = follows, len(self._kept)
-        rows = np.vstack([of_x, of_x, of_u, of_u, *[of_x] * times.behind])[self._kept]
-        self._given_units = rows.T - rows
-
-    def map(self, slot: int, usable: int, losses: int) -> IntervalMatrix:
-        """Return the map of z from a delivered update to the next one.
-
-        Args:
-            slot: number of the first update, modulo the number of slots.
-            usable: how long the update before it is used after its transmission, up to d.
-            losses: number of lost updates between the two.
-        """
-        return self._state_after(slot, usable, losses).rows(self._kept).interval().scaled(self._given_units)
 
     def period(self, slot: int, is_delivered: bool) -> IntervalMatrix:
         """Return the map of the state, in units of its own, from one transmission to the next.
 
         The state is (x, x_c, u, w) with the x of the transmissions before whose updates are on their way.
-
         Updates are used without a limit of time.
 
         Args:
@@ -225,54 +193,12 @@ class TimeTriggeredLoop:
         Raises:
             OverflowError: an entry is beyond double precision.
         """
-        arrival = self.times.delay if is_delivered else None
-        return self._next(self._start, slot * self.times.period, arrival, NEVER, NEVER).interval()
-
-    def _state_after(self, slot: int, usable: int, losses: int) -> FixedPointMatrix:
-        period = self.times.period
-        timeout = slot * period + self.times.timeout
-        states = self._states.setdefault((slot, usable), [])
-        while len(states) <= losses:
-            begin = (slot + len(states)) * period
-            if states:
-                states.append(self._next(states[-1], begin, None, timeout, timeout))
-            else:
-                first = self._state(begin)
-                states.append(self._next(first, begin, self.times.delay, begin + usable, timeout))
-        return states[losses]
-
-    def _next(
-        self, state: FixedPointMatrix, begin: int, delay: int | None, old_timeout: int, timeout: int
-    ) -> FixedPointMatrix:
-        """Return the state a period after a transmission.
-
-        Args:
-            state: that at the transmission.
-            begin: time of the transmission.
-            delay: time until an update arrives; None: none does.
-            old_timeout: time from which on x_c is too old until then.
-            timeout: the same, afterwards.
-        """
+        begin, state = slot * self.times.period, self._start
         end, sent = begin + self.times.period, [state.rows(part) for part in (self._x, *self._older)]
         loop, arrival = state.rows(self._loop), begin
-        if delay is not None:
-            arrival += delay
-            loop = self._between(begin, arrival, old_timeout) @ loop
+        if is_delivered:
+            arrival += self.times.delay
+            loop = self._between(begin, arrival) @ loop
             updated = exponential(self._H, self.times.whole_delay, self.times.parts) @ sent[-1]
             loop = stacked(loop.rows(self._x), updated, loop.rows(self._inputs))
-        return stacked(self._between(arrival, end, timeout) @ loop, *sent[:-1])
-
-    def _state(self, t: int) -> FixedPointMatrix:
-        """Return the state as a function of z at a transmission."""
-        z, n = fixed(np.eye(self.dimension)), self._x.stop
-        if self._has_new_x_c:
-            x, u = z.rows(slice(n)), z.rows(slice(n, None))
-            return stacked(x, x, u, u)
-        known = self.dimension - n * self.times.behind
-        x_and_x_c, older = z.rows(slice(2 * n)), z.rows(slice(known, None))
-        if self._follows:
-            since = self.times.since_tick(t)
-            u = self._K @ exponential(-self._H, since, self.times.parts) @ z.rows(self._x_c)
-        else:
-            u = z.rows(slice(2 * n, known))
-        return stacked(x_and_x_c, u, u, older)
+        return stacked(self._between(arrival, end) @ loop, *sent[:-1]).interval()

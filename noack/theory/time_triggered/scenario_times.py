@@ -15,7 +15,7 @@ from noack.impairments.kinds.delay import Delay
 from noack.scenario.resolution import rule_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.coverage import require_exact
-from noack.theory.margins.time_triggered_loop import NEVER, LoopTimes
+from noack.theory.time_triggered.time_triggered_loop import NEVER, LoopTimes
 
 _MOST_ON_THEIR_WAY = 40
 """Most updates on their way at once, times the number of states: the size of what is followed."""

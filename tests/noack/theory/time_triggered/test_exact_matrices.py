@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from noack.core.linear_systems import Matrix
-from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, exponential, inverse
+from noack.theory.time_triggered.exact_matrices import IntervalMatrix, exactly, exponential, inverse
 
 
 def rational(matrix: Matrix) -> Any:

@@ -6,16 +6,23 @@ import numpy as np
 import pytest
 
 from noack.guarantee.loss_guarantee import LossHistory
+from noack.theory.time_triggered.time_triggered_loop import LoopTimes, TimeTriggeredLoop
+from noack.theory.witnesses.coordinates import floats
 from tests.oracles.random_loops import random_loop
 
 
 @pytest.mark.parametrize("seed", [3, 5, 7, 9, 10, 13, 14, 15])  # others take up to a minute
 def test_patterns_of_random_loops_grow_as_proven(seed: int) -> None:
-    """Patterns are played step by step, without the maps between deliveries or their graph."""
+    """Patterns are played step by step, without the graph of bursts."""
     random = random_loop(seed)
     stability = random.margin.stability(random.guarantee)
-    loop, slots = random.margin.loop, random.margin.loop.times.slots
-    steps = [[loop.period(slot, fate).middle for fate in (False, True)] for slot in range(slots)]
+    times = random.margin.loop.times
+    A, B, K, H = map(floats, random.margin.loop.matrices)
+    exact = TimeTriggeredLoop(
+        A, B, K, H, LoopTimes(times.step, times.tick, times.phase, times.unit, times.rest)
+    )
+    slots = times.slots
+    steps = [[exact.period(slot, fate).middle for fate in (False, True)] for slot in range(slots)]
     fastest, longest = 0.0, 9
     for length in range(1, longest + 1):
         for pattern in product((True, False), repeat=length):

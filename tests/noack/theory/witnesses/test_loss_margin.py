@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flint import arb
 from scipy.linalg import expm
 
 from cosim.simulation.virtual_time import simulate
@@ -13,8 +14,9 @@ from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from noack.theory.margins.loss_margin import LossMargin
-from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop
+from noack.theory.witnesses.coordinates import floats
+from noack.theory.witnesses.loss_margin import LossMargin
+from noack_check.growth import Burst, PeriodicLoop
 from tests.helpers.approved import compare_lines, lines_of_error
 
 ROOT = Path(__file__).parents[4]
@@ -84,7 +86,7 @@ def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -
     resolved = scenario(name, "horizon_s=6", *settings)
     margin, loop = LossMargin(resolved), loop_of(resolved)
     times = margin.loop.times
-    delay_ns, behind = times.whole_delay // times.parts, times.behind
+    delay_ns, behind = int(margin.delay_ns), times.behind
     fates = np.random.default_rng(1).random(1000) < 0.5
     fates[0] = True
     numbers = iter(range(1000))
@@ -103,38 +105,40 @@ def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -
             return np.concatenate([step["x"], step["u"]])
         used = steps[np.searchsorted(steps["t_ns"], sent_ns[newest])]
         x_c = expm(loop.H * (sent_ns[number] - sent_ns[newest]) * 1e-9) @ used["x"]
-        loop_state = np.concatenate([step["x"], x_c, step["u"]])[: margin.loop.dimension - behind * loop.n]
-        return np.concatenate([loop_state, *(row["x"] for row in older)])
+        return np.concatenate([step["x"], x_c, step["u"], *(row["x"] for row in older)])
 
     slots = margin.loop.times.slots
     tolerance = 1e-11 if resolved.timing.has_whole_periods else 1e-7  # times are rounded there
     delivered = delivered[delivered < len(sent_ns) - behind]
     for before, present, following in zip(delivered[1:], delivered[2:], delivered[3:], strict=False):
-        usable = times.usable(int(present - before), times.delay)
-        slot = int((present + behind) % slots)
-        map_ = margin.loop.map(slot, usable, int(following - present - 1)).middle
+        usable = times.usable(int(present - before))
+        slot, units = int((present + behind) % slots), int(following - present)
+        map_ = floats(margin.loop.matrix(Burst(0, 0, slot, usable, units - 1, units)))
         expected = state(following + behind, present)
         np.testing.assert_allclose(
             map_ @ state(present + behind, before), expected, rtol=0, atol=tolerance * np.abs(expected).max()
         )
 
 
-def test_maps_over_thousands_of_steps_keep_their_digits() -> None:
+def test_matrices_over_thousands_of_steps_keep_their_digits() -> None:
     deadline = 'trigger={policy="deadline", interval_s=0.5, rule={policy="absolute", delta=1}}'
     # The same 3 s, with measurements every 2 ms and every 50 ms.
-    fine = LossMargin(scenario("lane_periodic", deadline)).maps(0, 0, 1499)
-    coarse = LossMargin(scenario("lane_periodic", deadline, "plant.measure_every=25")).maps(0, 0, 59)
-    assert fine.radius.max() < 1e-14
-    assert (abs(fine.middle - coarse.middle) <= fine.radius + coarse.radius).all()
+    fine = LossMargin(scenario("lane_periodic", deadline)).loop.matrix(Burst(0, 0, 0, 0, 5, 1500))
+    coarse = LossMargin(scenario("lane_periodic", deadline, "plant.measure_every=25")).loop
+    difference = fine - coarse.matrix(Burst(0, 0, 0, 0, 5, 60))
+    assert all(entry.contains(0) and entry.rad() < 1e-14 for entry in difference.entries())
 
 
 def test_the_margin_does_not_depend_on_the_unit_of_the_input() -> None:
-    resolved = scenario("unstable_pendulum", "mode=zoh")
-    loop, margin, guarantee = loop_of(resolved), LossMargin(resolved), LossGuarantee((LongestBurst(3),))
+    margin, guarantee = (
+        LossMargin(scenario("unstable_pendulum", "mode=zoh")),
+        LossGuarantee((LongestBurst(3),)),
+    )
     expected = margin.stability(guarantee)
+    loop = margin.loop
+    A, B, K, H = loop.matrices
     for unit in (2.0**40, 1e-12):
-        margin.loop = TimeTriggeredLoop(loop.A, loop.B * unit, loop.K / unit, loop.H, margin.loop.times)
-        margin.maps = margin.loop.map  # type: ignore[assignment]
+        margin.loop = PeriodicLoop((A, B * unit, K / arb(unit), H), loop.times, loop.between, loop.guarantee)
         stability = margin.stability(guarantee)
         assert stability.pattern == expected.pattern
         assert stability.lower == pytest.approx(expected.lower, rel=1e-9)

@@ -1,0 +1,214 @@
+"""The losses that a loop tolerates whatever its sensor measures: stable for all patterns, or not.
+
+The sensor is time-triggered, or transmits at unknown times with a longest time between two. What
+may happen between two deliveries under a guarantee is a graph of bursts; a pattern of losses, and of such
+times, is a path (:mod:`noack_check.growth`). :mod:`noack.theory.witnesses.growth` searches for witnesses
+of its growth, and every bound is one that noack-check has accepted.
+"""
+
+from collections.abc import Mapping
+from fractions import Fraction
+from types import MappingProxyType
+from typing import NamedTuple
+
+from noack.core.errors import CallerError
+from noack.guarantee.loss_guarantee import (
+    DeliveriesBetweenBursts,
+    LongestBurst,
+    LossesInWindow,
+    LossGuarantee,
+    outcome_letters,
+)
+from noack.scenario.scenario import Scenario
+from noack.theory.time_triggered.scenario_times import intervals, loop_times, require_covered
+from noack.theory.witnesses.growth import ACCURACY, Document, GrowthBounds, enclose_growth, intervals_of
+from noack_check.growth import Guarantee, PeriodicLoop, read_periodic_loop
+from noack_check.keys import RefusedError
+
+_COARSE_ACCURACY, _QUICK_ACCURACY = 1e-2, 3e-2
+"""Wanted upper/lower − 1 of :meth:`LossMargin.coarse_bounds` and :meth:`LossMargin.first_bounds`."""
+
+
+class Stability(NamedTuple):
+    """Bounds of the growth of all loss patterns of a guarantee."""
+
+    lower: float
+    """The pattern grows at least by this factor per longest interval, in the long run."""
+    upper: float
+    """No pattern grows by more than this factor per longest interval, in the long run."""
+    pattern: tuple[bool, ...]
+    """Whether each update is delivered, in a pattern that repeats from the first update on; mostly
+    it begins with a delivery."""
+    intervals_s: tuple[float, ...]
+    """The time from each update of the pattern to the next one."""
+    documents: Mapping[str, Document] = MappingProxyType({})
+    """The witnesses that noack-check has accepted, of the bounds "stable" and "unstable"."""
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in a word: stable, destabilised or undecided."""
+        if self.upper < 1:
+            return "stable"
+        return "destabilised" if self.lower > 1 else "undecided"
+
+    def with_upper_of(self, other: "Stability") -> "Stability":
+        """Return the same, with the upper bound of a guarantee that allows all these patterns."""
+        return self if other.upper >= self.upper else self._replace(upper=other.upper)
+
+    def with_lower_of(self, other: "Stability") -> "Stability":
+        """Return the same, with the lower bound of a guarantee whose patterns are among these."""
+        if other.lower <= self.lower:
+            return self
+        return self._replace(lower=other.lower, pattern=other.pattern, intervals_s=other.intervals_s)
+
+    def to_json(self) -> dict[str, object]:
+        """Return what is known, for JSON."""
+        known = self._asdict() | {"pattern": self.text, "verdict": self.verdict}
+        del known["documents"]
+        return known
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether the updates of the pattern are equally far apart."""
+        return len(set(self.intervals_s)) <= 1
+
+    @property
+    def text(self) -> str:
+        """The pattern, one letter per update: ``D`` delivered, ``L`` lost.
+
+        If they differ, the times to the next update stand between.
+        """
+        letters = outcome_letters(self.pattern)
+        if self.is_periodic:
+            return letters
+        return " ".join(
+            f"{letter} ({interval_s:g} s)"
+            for letter, interval_s in zip(letters, self.intervals_s, strict=True)
+        )
+
+
+def uncapped(guarantee: LossGuarantee) -> LossGuarantee:
+    """Return the rules besides the maximum number of consecutive losses."""
+    return LossGuarantee(tuple(rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)))
+
+
+def capped(guarantee: LossGuarantee, losses: int) -> LossGuarantee:
+    """Return a guarantee with another maximum number of consecutive losses."""
+    return LossGuarantee((LongestBurst(losses), *uncapped(guarantee).rules))
+
+
+def checked_guarantee(guarantee: LossGuarantee) -> Guarantee:
+    """Return a guarantee as noack-check has it."""
+    rules, longest = guarantee.rules, guarantee.longest_burst
+    if longest is None:
+        raise CallerError(f"{guarantee.meaning}: needs a maximum of losses")
+    windows = ((rule.limit, rule.window) for rule in rules if isinstance(rule, LossesInWindow))
+    recoveries = (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts))
+    return Guarantee(longest, tuple(windows), tuple(recoveries))
+
+
+class LossMargin:
+    """The loop of a scenario, with its own or another longest time between two transmissions.
+
+    Args:
+        resolved: the resolved scenario.
+        longest: longest time between two transmissions, in measurements; by default the scenario's.
+
+    Raises:
+        CallerError: the loop is not covered; the message names the setting.
+    """
+
+    def __init__(self, resolved: Scenario, longest: int | None = None) -> None:
+        require_covered(resolved)
+        self.guarantee = resolved.network.guarantee
+        between = intervals(resolved)
+        self.shortest, self.longest = between[0], between[-1]
+        """In measurements."""
+        if longest is not None:
+            is_regular = self.shortest == self.longest
+            self.shortest = longest if is_regular else min(self.shortest, longest)
+            self.longest = longest
+        self._unit = self.longest if self.shortest == self.longest else 1
+        self._measurement = resolved.timing.measurement_period
+        loop_times(resolved, self._unit)  # refuses what is not covered, naming the setting
+        try:
+            self.loop = read_periodic_loop(resolved.content(), longest)
+        except RefusedError as error:
+            raise CallerError(str(error)) from None
+        # A controller that knows x(0) gets its first update after a period.
+        knows_start = resolved.network.initial_sync == "known_state"
+        # Where updates are on their way for several periods, the first one arrives so much later.
+        self._first_slot = (int(knows_start) + self.loop.times.behind) % self.loop.times.slots
+
+    def seconds(self, measurements: int) -> float:
+        """Return the time of a number of measurements."""
+        return self._measurement.times(measurements).seconds
+
+    @property
+    def delay_ns(self) -> Fraction:
+        """The delay of an update."""
+        times = self.loop.times
+        return Fraction(times.behind * times.unit + times.rest, times.parts)
+
+    def stability(
+        self,
+        guarantee: LossGuarantee | None = None,
+        accuracy: float = ACCURACY,
+        *,
+        decide: bool = True,
+        effort: float = 1.0,
+    ) -> Stability:
+        """Bound the growth of all patterns of a guarantee, by default the scenario's.
+
+        Args:
+            guarantee: the guarantee.
+            accuracy: wanted upper/lower − 1.
+            decide: whether bounds on both sides of 1 are improved.
+            effort: factor of the limit of the work for that.
+
+        Raises:
+            CallerError: the loop grows so much between deliveries that products overflow, or the
+                guarantee allows too many patterns.
+        """
+        guarantee = guarantee or self.guarantee
+        loop = self.loop.under(checked_guarantee(guarantee))
+        try:
+            bounds = enclose_growth(loop, accuracy, decide=decide, effort=effort)
+        except RefusedError as error:
+            raise CallerError(
+                f"network: {guarantee.meaning}: {error}; reduce mansd, the windows of the constraints, "
+                "or the number of measurements between two events"
+            ) from None
+        except OverflowError:
+            raise CallerError(
+                "the loop grows beyond 1e308 within some deliveries, or the units of its states and "
+                "inputs are too different; reduce mansd or the period, or use other units"
+            ) from None
+        return self._stability(loop, bounds)
+
+    def _stability(self, loop: PeriodicLoop, bounds: GrowthBounds) -> Stability:
+        # In another slot than the first update's the pattern may grow less.
+        path, slots = bounds.cycle, [burst.slot for burst in bounds.cycle]
+        begin = slots.index(self._first_slot) if self._first_slot in slots else 0
+        path = path[begin:] + path[:begin]
+        pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
+        if path and len(loop.between) == 1:
+            begin = (self._first_slot - path[0].slot) % loop.times.slots % len(pattern)
+            pattern = pattern[begin:] + pattern[:begin]
+        units = (steps for burst in path for steps in intervals_of(burst, loop.between))
+        documents = {"stable": bounds.stable, "unstable": bounds.unstable}
+        return Stability(
+            bounds.lower,
+            bounds.upper,
+            tuple(pattern),
+            tuple(self.seconds(steps * self._unit) for steps in units),
+            {kind: document for kind, document in documents.items() if document is not None},
+        )
+
+    def coarse_bounds(self, guarantee: LossGuarantee | None = None) -> Stability:
+        """Return coarser bounds, which decide whether all patterns are stable."""
+        return self.stability(guarantee, _COARSE_ACCURACY)
+
+    def first_bounds(self) -> Stability:
+        """Return bounds that take less than a second; they may leave stability undecided."""
+        return self.stability(accuracy=_QUICK_ACCURACY, decide=False)
