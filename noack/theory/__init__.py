@@ -6,17 +6,17 @@
    between samples; the gains of a loop; what a trigger and the disturbances contribute.
 3. ``certificates``: the inequalities between all signals of a loop, their solution, and what it
    guarantees of a scenario, with its assumptions.
-4. ``margins``: for a time-triggered sensor, or one with a longest time between events, whether all
-   loss patterns are stable. This is a question about products of matrices, and needs no bounds of
-   signals.
+4. ``witnesses``: the search for what noack-check proves: bounds, regions, and the growth of a loop
+   whose sensor is time-triggered, or has a longest time between events. ``time_triggered`` has the
+   maps of such loops.
 5. ``random_losses``: what holds if nothing limits the number of consecutive losses.
 
 ``coverage.py`` and ``keys.toml`` say which settings of a scenario all this covers.
 
 The docstring of each part has its chain of arguments. Labels such as eq:LossEv3 are those of the
 paper's source. docs/theory.md states the results, docs/derivations.md has the proofs and a table of
-the files. Modules are imported in the order bounds, paper, certificates and margins,
-random_losses: the paper's formulas need enclosed suprema, too.
+the files. Modules are imported in the order bounds, paper, certificates and
+time_triggered, random_losses and witnesses: the paper's formulas need enclosed suprema, too.
 
 Modules of scipy are imported in the functions that use them: their import takes longer than that of
 everything else here, and most certificates do not need them.
