@@ -395,9 +395,19 @@ def read_periodic_loop(resolved: Table, longest: int | None = None) -> PeriodicL
     rest = delay - behind * unit
     exact = (schedule.step, schedule.tick, schedule.exact_phase, unit, rest, timeout.after_ns or Fraction(0))
     parts = lcm(*(t.denominator for t in exact))
-    *whole, after = (int(t * parts) for t in exact)
-    times = Times(*whole, behind, None if timeout.after_ns is None else after, timeout.holds_input, parts)
-    if times.slots > _MOST_SLOTS or lcm(times.step, times.tick) // min(times.step, times.tick) > _MOST_STEPS:
+    step, tick, first_tick, whole_unit, rest_of_delay, after = (int(t * parts) for t in exact)
+    times = Times(
+        step=step,
+        tick=tick,
+        phase=first_tick,
+        unit=whole_unit,
+        rest=rest_of_delay,
+        behind=behind,
+        timeout=None if timeout.after_ns is None else after,
+        holds_input=timeout.holds_input,
+        parts=parts,
+    )
+    if times.slots > _MOST_SLOTS or lcm(step, tick) // min(step, tick) > _MOST_STEPS:
         raise RefusedError("the times of the loop repeat only after too many steps")
     if most > _MOST_UNITS:
         raise RefusedError("trigger: too many measurements between two events")
