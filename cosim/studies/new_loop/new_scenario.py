@@ -608,7 +608,7 @@ def _notes(
     trial: _Trial, certificate: ScenarioCertificate, returns: bool, *, of_plant: bool
 ) -> Iterator[str]:
     """Yield what was chosen and found, a sentence each; ``of_plant``: a guarantee is for the plant itself."""
-    yield f"K: {trial.gain.method}; decay rate of Â + B̂K: {trial.gain.decay_per_s:.3g} /s."
+    yield f"u = K x_c: {trial.gain.method}; without errors x decays as e^(−{trial.gain.decay_per_s:.3g}t)."
     plant = "the plant" if of_plant else "the linear plant ẋ = Âx + B̂u"
     if of_plant:
         pass
