@@ -41,6 +41,16 @@ class _PatternRun(NamedTuple):
     pattern: Pattern
     event_s: tuple[float, ...]
     values: dict[Objective, tuple[float, float | None]]
+    shares: tuple[float, ...]
+    """The largest share of its bound that each output has."""
+
+
+class WorstByRuns(NamedTuple):
+    """What the search found."""
+
+    objectives: list[WorstRun]
+    shares: dict[str, float]
+    """The largest share of its certified bound that each stated output has, by the outputs' names."""
 
 
 def find_worst_by_runs(
@@ -50,7 +60,7 @@ def find_worst_by_runs(
     *,
     most_runs: int = RUNS,
     report: SearchReport = lambda step, nodes, value: None,
-) -> list[WorstRun]:
+) -> WorstByRuns:
     """Search the loss patterns of any plant by simulated runs; see :func:`.find_worst`.
 
     Args:
@@ -97,7 +107,7 @@ def find_worst_by_runs(
                 elapsed_s=time.monotonic() - began_s,
             )
         )
-    return found
+    return WorstByRuns(found, runs.shares())
 
 
 class _PatternRuns:
@@ -112,6 +122,8 @@ class _PatternRuns:
     ) -> None:
         self._resolved, self._certificate, self._report = resolved, certificate, report
         self._objectives = objectives
+        is_bounded = certificate.first("state") is not None and resolved.outputs is not None
+        self._outputs = resolved.loop_outputs() if is_bounded else ()
         self._known: dict[Pattern, _PatternRun] = {}
         self._delay_ns = network_delay_ns(resolved, 0)
         self.events = 0
@@ -137,6 +149,11 @@ class _PatternRuns:
         """Return the worst run so far."""
         return max(self._known.values(), key=lambda run: run.values[objective][0])
 
+    def shares(self) -> dict[str, float]:
+        """Return the largest share of its bound that each output had in any run."""
+        all_shares = [run.shares for run in self._known.values()]
+        return {output.name: max(column) for output, *column in zip(self._outputs, *all_shares, strict=True)}
+
     def improve(self, objective: Objective, until: int) -> None:
         """Change single outcomes of the worst run, up to a number of runs or until none makes it worse."""
         while True:
@@ -157,7 +174,11 @@ class _PatternRuns:
             objective: _value(record, objective, self._certificate, network.event_s)
             for objective in self._objectives
         }
-        return _PatternRun(tuple(network.delivered), tuple(network.event_s), values)
+        shares = tuple(
+            _share(record, output.row, self._certificate.of_output(index, output.row))
+            for index, output in enumerate(self._outputs)
+        )
+        return _PatternRun(tuple(network.delivered), tuple(network.event_s), values, shares)
 
 
 class _PatternNetwork:
@@ -215,6 +236,15 @@ def _value(
     scaled = size * _relative_level(certificate, objective, t_s)
     at = int(scaled.argmax())
     return float(scaled[at]), float(t_s[at])
+
+
+def _share(record: RunRecord, row: Sequence[float], bound: ScenarioCertificate) -> float:
+    """Return the largest share of its bound that an output has in a run."""
+    shares = [
+        np.abs(part.plant.x @ np.array(row)) / bound.state(part.plant.t_ns / NS_PER_S)
+        for part in aligned_parts(record)
+    ]
+    return float(np.concatenate(shares).max(initial=0.0))
 
 
 def _bound(certificate: ScenarioCertificate, objective: Objective, t_s: Vector) -> Vector | None:

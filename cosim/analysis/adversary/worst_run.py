@@ -1,7 +1,7 @@
 """The worst run that the adversary found, as values, as a table and as JSON."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -19,7 +19,7 @@ from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import network_delay_ns
 
-_BREACH = 1 + 1e-9
+BREACH = 1 + 1e-9
 """Share of the bound from which on a run refutes it; below are rounding errors."""
 
 
@@ -68,7 +68,7 @@ class WorstRun:
     @property
     def breaches(self) -> bool:
         """Whether this run refutes the certificate."""
-        return self.tightness is not None and self.tightness > _BREACH
+        return self.tightness is not None and self.tightness > BREACH
 
     @property
     def diverges(self) -> bool:
@@ -127,9 +127,13 @@ def _square_integral(constants: Constants, until_s: float) -> float:
 
 
 def document(
-    results: Sequence[WorstRun], resolved: Scenario, certificate: ScenarioCertificate, trigger: str
+    results: Sequence[WorstRun],
+    resolved: Scenario,
+    certificate: ScenarioCertificate,
+    trigger: str,
+    shares: Mapping[str, float],
 ) -> dict[str, object]:
-    """Return the results as JSON."""
+    """Return the results as JSON; ``shares`` are those of their bounds that outputs have, by their names."""
     return {
         "scenario": resolved.name,
         "mode": resolved.mode,
@@ -140,6 +144,7 @@ def document(
         "horizon_s": resolved.horizon_s,
         "certificate": certificate.to_json(),
         "worst": {worst.objective.value: worst.to_json() for worst in results},
+        "outputs": {name: {"tightness": share} for name, share in shares.items()},
     }
 
 
@@ -149,8 +154,9 @@ def print_worst(
     resolved: Scenario,
     certificate: ScenarioCertificate,
     trigger: str,
+    shares: Mapping[str, float],
 ) -> None:
-    """Print the results and their loss patterns."""
+    """Print the results and their loss patterns, and the shares of their bounds that outputs have."""
     table = Table(
         title=f"{resolved.name}: worst losses found, {resolved.network.guarantee.meaning}, "
         f"{resolved.horizon_s:g} s"
@@ -167,6 +173,8 @@ def print_worst(
             "[bold red]exceeded[/]" if worst.breaches else _share_used(worst.tightness),
         )
     console.print(table)
+    for name, share in shares.items():
+        console.print(f"{escape(name)}: {_share_used(share)} of its bound was reached")
     for worst in results:
         time_text = "" if worst.at_s is None else f"worst at {worst.at_s:.6f} s; "
         coverage = "all patterns searched" if worst.exact else "not all patterns searched"

@@ -209,7 +209,7 @@ def adversary(
     that is not given by matrices, some hundred patterns are simulated.
     """
     from cosim.analysis import adversary as adversary_search
-    from cosim.analysis.adversary.worst_run import WorstRun, document, print_worst
+    from cosim.analysis.adversary.worst_run import BREACH, WorstRun, document, print_worst
     from cosim.cli.execute_run import warn_of_left_out
     from cosim.live.monitoring.progress import search_activity
     from noack.scenario.resolution import resolve
@@ -236,11 +236,12 @@ def adversary(
     kinds, is_all = adversary_search.Objective, objective is AdversaryAim.ALL
     aims = list(kinds) if is_all else [kinds(objective.value)]
     worst_cases: list[WorstRun] = []
+    shares: dict[str, float] = {}
     stopped: StopRequestError | None = None
     try:
         with search_activity() as report:
             if by_runs:
-                worst_cases += adversary_search.find_worst_by_runs(
+                worst_cases, shares = adversary_search.find_worst_by_runs(
                     resolved, aims, certificate, report=report("losses")
                 )
             for aim in () if by_runs else aims:
@@ -259,14 +260,15 @@ def adversary(
             raise
         stopped = stop
     if json:
-        print_json(document(worst_cases, resolved, certificate, trigger.value))
+        print_json(document(worst_cases, resolved, certificate, trigger.value, shares))
     else:
-        print_worst(console(), worst_cases, resolved, certificate, trigger.value)
+        print_worst(console(), worst_cases, resolved, certificate, trigger.value, shares)
     if stopped is not None:
         missing = ", ".join(aim.value for aim in aims[len(worst_cases) :])
         print_to_stderr(f"noack: {stopped}; missing: {missing}")
         return stopped.exit_status
-    return ExitStatus.FAILED if any(worst.breaches for worst in worst_cases) else ExitStatus.OK
+    is_exceeded = any(worst.breaches for worst in worst_cases) or max(shares.values(), default=0.0) > BREACH
+    return ExitStatus.FAILED if is_exceeded else ExitStatus.OK
 
 
 def _region_certificate(resolved: "Scenario") -> "ScenarioCertificate":

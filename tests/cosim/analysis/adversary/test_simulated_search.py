@@ -15,7 +15,7 @@ def test_runs_of_a_linear_plant_have_the_values_of_the_linear_search() -> None:
     resolved = resolve(noack.load("unstable_pendulum", {"horizon_s": 2.0}))
     certificate = certify(resolved, conditions_of(resolved, continuous=False))
     aims = (Objective.ERROR, Objective.STATE)
-    by_runs = find_worst_by_runs(resolved, aims, certificate, most_runs=40)
+    by_runs = find_worst_by_runs(resolved, aims, certificate, most_runs=40).objectives
     for aim, found in zip(aims, by_runs, strict=True):
         searched = find_worst(resolved, aim, most_nodes=2_000, beam=16, certificate=certificate)
         # Errors are those at measurements, where the record has them, there at steps of the plant.
@@ -30,20 +30,23 @@ def test_runs_of_a_linear_plant_have_the_values_of_the_linear_search() -> None:
 
 
 def test_a_plant_of_equations_is_searched_by_runs_within_its_guarantee() -> None:
-    scenario = noack.load("sine_pendulum", {"horizon_s": 1.5})
+    outputs = [{"name": "angle", "row": [1.0, 0.0]}]
+    scenario = noack.load("sine_pendulum", {"horizon_s": 1.5, "outputs": outputs})
     results, resolved = certificates_of(scenario, of_model=True), resolve(scenario)
     results.prove(conditions=("schedule",))
     certificate = results.of_own_plant
     assert certificate is not None
     assert certificate.proven is not None
-    found = find_worst_by_runs(resolved, ALL, certificate, most_runs=24)
+    found, shares = find_worst_by_runs(resolved, ALL, certificate, most_runs=24)
     assert [worst.objective for worst in found] == list(ALL)
     for worst in found:
         assert worst.pattern[0]
         assert "L" * (resolved.network.mansd + 1) not in worst.text
         assert not worst.breaches
         assert worst.runs <= 24 + 2 * len(ALL)
-    assert found == find_worst_by_runs(resolved, ALL, certificate, most_runs=24)
+    assert (found, shares) == find_worst_by_runs(resolved, ALL, certificate, most_runs=24)
+    assert shares.keys() == {"angle"}
+    assert 1 / 3 < shares["angle"] <= 1
     (state,) = (worst for worst in found if worst.objective is Objective.STATE)
     assert state.tightness is not None
     assert state.tightness > 1 / 3
