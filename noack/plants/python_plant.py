@@ -5,7 +5,7 @@ but not the run.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from types import SimpleNamespace
@@ -26,6 +26,7 @@ from noack.plants.plant_settings import (
     SystemFailedError,
     name_and_unit,
 )
+from noack.settings.section import require_distinct
 from noack.settings.user_files import ClassSettings, UserCode, new_instance, read_only, real_vector, user_code
 
 _PLACE = "plant.system"
@@ -62,7 +63,9 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
                 return None
             states, inputs = _texts("states", plant.states), _texts("inputs", plant.inputs)
             names = [name_and_unit(state)[0] for state in states]
-            allowed = dict(getattr(plant, "allowed", {}))
+            allowed = getattr(plant, "allowed", {})
+            if not isinstance(allowed, Mapping):
+                raise ValueError(f'allowed is {allowed!r}; give errors by states, e.g. {{"angle": 0.02}}')
             for name, value in allowed.items():
                 if name not in names:
                     raise ValueError(f"allowed: {name!r} is no state; the states are {', '.join(names)}")
@@ -71,7 +74,7 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
             start = getattr(plant, "initial_state", None)
             x0 = None if start is None else real_vector("initial_state", start, len(states))
         initial_state = None if x0 is None else tuple(x0.tolist())
-        return PlantOutline(len(states), len(inputs), states, inputs, None, allowed, initial_state)
+        return PlantOutline(len(states), len(inputs), states, inputs, None, dict(allowed), initial_state)
 
 
 def _texts(name: str, values: object) -> tuple[str, ...]:
@@ -81,6 +84,7 @@ def _texts(name: str, values: object) -> tuple[str, ...]:
     texts = tuple(values)
     if not texts or not all(isinstance(text, str) and text for text in texts):
         raise ValueError(f'{name} is {values!r}; give a list of names, e.g. ["angle, rad"]')
+    require_distinct(tuple(name_and_unit(text)[0] for text in texts), name)
     return texts
 
 

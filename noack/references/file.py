@@ -73,10 +73,14 @@ class FilePiece(PieceSettings):
             if len(rows) != len(self.t_s) or any(len(row) != width for row in rows):
                 raise ValueError(f"{name}: expected {len(self.t_s)} rows of {width} numbers")
         t_s = np.array(self.t_s)
-        if t_s[0] != 0 or t_s[-1] < horizon_s or (np.diff(t_s) < 1e-6).any():
+        close = np.flatnonzero(np.diff(t_s) < 1e-6)
+        if t_s[0] != 0 or t_s[-1] < horizon_s or len(close):
+            found = f"{t_s[0]:g} to {t_s[-1]:g} s"
+            if len(close):
+                found = f"{t_s[close[0]]:.9g} s in row {close[0] + 1}, then {t_s[close[0] + 1]:.9g} s"
             raise ValueError(
                 f"{TIME}: expected ascending times from 0 to the horizon, {horizon_s:g} s, at least "
-                f"1 us apart; found {t_s[0]:g} to {t_s[-1]:g} s"
+                f"1 us apart; found {found}"
             )
         self._require_solution(A, B)
 
@@ -94,7 +98,8 @@ class FilePiece(PieceSettings):
             start = np.concatenate([x[row], u[row], slope])
             half_s = length_ns * 0.5e-9
             curve = half_s ** np.arange(4) @ segment.polynomial[:, :n]
-            errors = [steps[length_ns][0] @ start - x[row + 1], steps[length_ns][1] @ start - curve]
+            with np.errstate(over="ignore", invalid="ignore"):
+                errors = [steps[length_ns][0] @ start - x[row + 1], steps[length_ns][1] @ start - curve]
             for error, place in zip(errors, ("row", "the curve half-way to row"), strict=True):
                 if not (np.abs(error) <= self.tolerance * scale).all():
                     worst = int(np.argmax(np.abs(error) / scale))

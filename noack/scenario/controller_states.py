@@ -76,7 +76,7 @@ def check_controller_states(scenario: ScenarioTables) -> None:
     model = controlled_model(scenario.model, controller)
     if not model.allow_unstable and (reason := instability(*model.trigger_matrices)) is not None:
         raise ValueError(
-            f"controller: with its states, {reason}; to run the unstable loop anyway, set "
+            f"controller.A: with the controller's states, {reason}; to run the unstable loop anyway, set "
             "model.allow_unstable = true"
         )
 

@@ -44,6 +44,7 @@ from noack.settings.section import (
     Row,
     ScenarioSection,
     kinds_in,
+    require_distinct,
     require_length,
     require_shape,
     shape,
@@ -131,6 +132,8 @@ class ModelSection(ScenarioSection):
         require_shape(self.gain, "gain", (m, n), "one row per input, one column per state")
         require_length(self.state_names, "state_names", n, "one name per state")
         require_length(self.input_names, "input_names", m, "one name per input")
+        require_distinct(self.state_names, "state_names")
+        require_distinct(self.input_names, "input_names")
         self._check_loads(n)
         self._require_stable()
         if self.integral is not None:  # loading a scenario replaces it

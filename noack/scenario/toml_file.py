@@ -202,6 +202,7 @@ _LISTS: dict[object, str] = {
 }
 """By the type of the list's entries."""
 _WITH_UNIT = re.compile(r"\s*[-+]?\.?[0-9].*")
+_KIND_OF_VALUE = re.compile(r"str|literal\[.*\]|tuple\[.*\]")
 _PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
 
 
@@ -210,7 +211,7 @@ def explain(error: ValidationError, source: str, root: type[ScenarioSection]) ->
 
     ``source`` names the file; ``root`` is the model of the whole file.
     """
-    mistakes = error.errors(include_url=False)
+    mistakes = [mistake for mistake in error.errors(include_url=False) if _concerns(mistake)]
     places = [mistake["loc"] for mistake in mistakes]
     lines = [
         printable(f"{source}: {_explain(mistake, root)}")
@@ -220,6 +221,24 @@ def explain(error: ValidationError, source: str, root: type[ScenarioSection]) ->
     ]
     surplus = len(mistakes) - _MOST_LINES
     return [*lines, printable(f"{source}: {surplus} more mistakes")] if surplus > 0 else lines
+
+
+def _concerns(mistake: ErrorDetails) -> bool:
+    """Whether a mistake is of the kind of value that is given; its place then is that of the value.
+
+    Of a value that may be a text or a list, pydantic has mistakes of both, and a part of their place
+    is the kind.
+    """
+    place = mistake["loc"]
+    kinds = [at for at, part in enumerate(place) if at and _KIND_OF_VALUE.fullmatch(str(part))]
+    if not kinds or mistake["type"] == "extra_forbidden":
+        return True
+    at = kinds[0]
+    mistake["loc"] = place[:at] + place[at + 1 :]
+    if str(place[at]).startswith("tuple["):
+        return mistake["type"] != "tuple_type" or len(place) > at + 1
+    mistake["msg"] += ", or a list"
+    return not isinstance(mistake["input"], list | tuple)
 
 
 def nearest_key(key: str, known_keys: Iterable[str]) -> str | None:

@@ -197,6 +197,13 @@ def require_length(row: tuple[object, ...] | None, key: str, expected: int, reas
         raise ValueError(f"{key}: expected {expected} entries ({reason}), found {len(row)}")
 
 
+def require_distinct(names: tuple[str, ...] | None, key: str) -> None:
+    """Raise ValueError if a name occurs twice in a list of names that is given."""
+    for name in names or ():
+        if (names or ()).count(name) > 1:
+            raise ValueError(f"{key}: {name} occurs more than once; give each a name of its own")
+
+
 Settings = TypeVar("Settings", bound=ScenarioSection)
 
 

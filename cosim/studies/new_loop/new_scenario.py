@@ -105,6 +105,8 @@ _LONGEST_RUN_S = 20.0
 """Wall time of a live run; a longer horizon runs faster."""
 _SHORTEST_HORIZON_S = 4.6
 """A shorter run would show little."""
+_MOST_STEPS_PER_TIME_CONSTANT = 1e6
+"""Of a slower loop, each simulation would take minutes or more."""
 _LONGEST_HORIZON_S, _HIGHEST_SPEED = 1e7, 1000.0
 """The largest that a scenario may have."""
 
@@ -300,6 +302,7 @@ def _list_trials(
         gains = [gain(model, q=q, r=r) for r in input_weights]
         if allowed and has_friction:
             gains = [each for each in gains if _sticks_within(each, x0, allowed)] or gains[-1:]
+    is_tried, slowest_per_s = False, 0.0
     for loop_gain in gains:
         fastest = max(
             (size for size in np.abs(loop_gain.eigenvalues) if size < _FASTEST_EIGENVALUE_PER_S), default=1
@@ -307,6 +310,10 @@ def _list_trials(
         least_rate_hz = _STEPS_PER_TIME_CONSTANT * fastest
         usual_hz = next((rate_hz for rate_hz in _RATES_HZ if rate_hz >= least_rate_hz), _RATES_HZ[-1])
         usual_hz = loop_gain.model.plant.rates.get("rate_hz", usual_hz)
+        slowest_per_s = usual_hz / _MOST_STEPS_PER_TIME_CONSTANT
+        if loop_gain.decay_per_s < slowest_per_s:
+            continue
+        is_tried = True
         is_fixed = loop_gain.model.plant.system.has_own_step
         # Delays cost most with the stiff gain that friction needs.
         usual_hz = 2 * usual_hz if has_friction and not is_fixed else usual_hz
@@ -317,6 +324,12 @@ def _list_trials(
                     alpha = to_digits(min(share * loop_gain.decay_per_s, fastest_per_s))
                     weight = _unit_weight(loop_gain, x0, allowed)
                     yield _Trial(loop_gain, rate_hz, mansd, alpha, x0, weight, has_friction)
+    if not is_tried:
+        raise CallerError(
+            f"{linear.plant.label}: without errors x decays as e^(−{gains[0].decay_per_s:.3g}t) only, too "
+            f"slowly for its fastest eigenvalue: at least e^(−{slowest_per_s:.3g}t) is needed; choose "
+            "a faster gain with noack gain --q or --poles"
+        )
 
 
 def _state_weights(model: LinearModel, allowed: Mapping[str, float]) -> list[float] | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from cosim.shipped_files import find_shipped, shipped_names
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, did_you_mean
+from noack.core.errors import CallerError, did_you_mean, one_line
 from noack.core.extension_points import missing_extension
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.linear import LinearSettings
@@ -165,9 +165,16 @@ def _positive_rate(key: str, value: object) -> float:
 
 
 def _classes(path: Path) -> list[str]:
-    """Return the names of the classes in a Python file, as far as it can be read."""
-    with suppress(OSError, SyntaxError, ValueError):
-        statements = ast.parse(path.read_bytes()).body
+    """Return the names of the classes in a Python file; none if it cannot be read.
+
+    Raises:
+        CallerError: it is not Python.
+    """
+    with suppress(OSError):
+        try:
+            statements = ast.parse(path.read_bytes(), path.name).body
+        except (SyntaxError, ValueError) as error:
+            raise CallerError(f"{path}: {type(error).__name__}: {one_line(error)}") from None
         return [statement.name for statement in statements if isinstance(statement, ast.ClassDef)]
     return []
 

@@ -120,7 +120,7 @@ def test_outputs_that_cannot_be_held_together_are_named() -> None:
         ({"model.integral": ["angle", "speed"]}, "model.integral: the model rests at speed = 0 only"),
         ({"model.gain": [[-11.75, -2.5]]}, "model.gain: 1 x 2, expected 1 x 3"),
         ({"model.gain": None}, "model.gain: missing, expected 1 x 3"),
-        ({"model.gain": [[-11.75, -2.5, -15.0]]}, "with its states, u = K x does not stabilise the model"),
+        ({"model.gain": [[-11.75, -2.5, -15.0]]}, "with the controller's states, u = K x does not"),
         ({"model.load": "input"}, 'model.load = "input": not with controller.kind = "state_space"'),
         ({"controller.kind": "python", "controller.name": "m:C"}, "model.integral: not with controller.kind"),
         ({"model.integral": []}, "model.integral = []: give the names of outputs"),

@@ -152,6 +152,7 @@ def test_what_is_wrong_is_refused_with_the_approved_line(tmp_path: Path) -> None
     rows = rows_of_a_solution(np.linspace(0, 10, 1001))
     write(tmp_path / "columns.csv", rows, "t_s,angle,velocity,voltage")
     write(tmp_path / "short.csv", rows[:500])
+    write(tmp_path / "back.csv", np.insert(rows, 500, rows[400], axis=0))
     (tmp_path / "numbers.csv").write_text("t_s,angle,speed,voltage\n0,0,0,0\n1,0,x,0\n")
     rows[700, 1] += 0.01
     write(tmp_path / "jump.csv", rows)

@@ -254,6 +254,40 @@ def test_a_plant_that_cannot_be_stabilised_gives_one_line() -> None:
         noack.new(model)
 
 
+@pytest.mark.parametrize(
+    ("states", "allowed", "force", "line"),
+    [
+        ('["angle", "angle"]', "{}", "u[0]", "states: angle occurs more than once"),
+        ('["angle, rad", "angle, m"]', "{}", "u[0]", "states: angle occurs more than once"),
+        ('["angle", "rate"]', '["angle"]', "u[0]", "allowed is ['angle']; give errors by states"),
+        (
+            '["angle", "rate"]',
+            "{}",
+            "u[0] + )",
+            "mistaken.py: SyntaxError: unmatched ')' (mistaken.py, line 7)",
+        ),
+        # Of a loop that decays as e^(-2.5e-10t), simulations would not end.
+        (
+            '["angle", "rate"]',
+            "{}",
+            "1e-9 * u[0]",
+            "without errors x decays as e^(−2.5e-10t) only, too slowly",
+        ),
+    ],
+)
+def test_a_mistake_in_a_class_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, states: str, allowed: str, force: str, line: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mistaken.py").write_text(
+        f"class Arm:\n    states = {states}\n    inputs = ['torque']\n    allowed = {allowed}\n\n"
+        f"    def derivative(self, t_s, z, u):\n        return z[1], {force} - 4.0 * z[1]\n"
+    )
+    result = invoke("new", "mistaken.py")
+    assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
+    assert line in result.stderr
+
+
 def test_the_lines_about_mistakes_are_those_that_were_approved() -> None:
 
     def mistake(line: str) -> list[str]:
