@@ -29,7 +29,7 @@ from noack.observers.luenberger import LuenbergerSettings
 from noack.scenario.loads import COMPARING_ERRORS, padded, with_weight
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.sections import AnyObserver, ModelSection, PlantSection, instability
-from noack.settings.section import MatrixRows, require_shape, rows_of
+from noack.settings.section import MatrixRows, require_distinct, require_shape, rows_of
 from noack.trigger_policies.policy_settings import CombinedSettings
 
 S = TypeVar("S", bound=ScenarioTables)
@@ -74,6 +74,7 @@ def check_controller_states(scenario: ScenarioTables) -> None:
             f"one of {', '.join(COMPARING_ERRORS)}"
         )
     model = controlled_model(scenario.model, controller)
+    require_distinct(model.state_names, "model.state_names")
     if not model.allow_unstable and (reason := instability(*model.trigger_matrices)) is not None:
         raise ValueError(
             f"controller.A: with the controller's states, {reason}; to run the unstable loop anyway, set "

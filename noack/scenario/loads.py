@@ -28,7 +28,7 @@ from noack.observers.luenberger import LuenbergerSettings
 from noack.observers.observer_settings import NoiseVariances, observer_gain, unobservable_mode
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.sections import AnyObserver, ModelSection, PlantSection
-from noack.settings.section import require_length, rows_of
+from noack.settings.section import require_distinct, require_length, rows_of
 from noack.trigger_policies.policy_settings import CombinedSettings, PolicySettings, WeightedSettings
 
 S = TypeVar("S", bound=ScenarioTables)
@@ -123,6 +123,8 @@ def _check_changes(scenario: ScenarioTables) -> None:
         if change.at_s < last_s:
             raise ValueError(f"{place}.at_s: earlier than the change before it")
         last_s = change.at_s
+    if scenario.model.load is not None:
+        require_distinct(loaded_model(scenario.model).state_names, "model.state_names")
     if plant.load and not scenario.coverage.is_linear and scenario.model.load != "input":
         raise ValueError('plant.load: a plant that is not linear can have it with model.load = "input" only')
 

@@ -201,7 +201,8 @@ def require_distinct(names: tuple[str, ...] | None, key: str) -> None:
     """Raise ValueError if a name occurs twice in a list of names that is given."""
     for name in names or ():
         if (names or ()).count(name) > 1:
-            raise ValueError(f"{key}: {name} occurs more than once; give each a name of its own")
+            given = ", ".join(names or ())
+            raise ValueError(f"{key}: {name} occurs more than once in {given}; give each a name of its own")
 
 
 Settings = TypeVar("Settings", bound=ScenarioSection)

@@ -180,6 +180,7 @@ def test_the_checker_reads_it_with_an_observer_about_a_reference() -> None:
         ({"controller.D": [[1.0]]}, "expected 1 x 2 (one row per input, one column"),
         ({"controller.A": [[0.0, 1.0]]}, "the controller's matrix A is square"),
         ({"controller.A": None}, "give the matrices A, B and C"),
+        ({"model.state_names": ["angle", "controller"]}, "controller occurs more than once"),
         ({"controller.C": [[8.0]]}, "with the controller's states, u = K x does not stabilise"),
         ({"plant.measurement.noise_std": [0.1, 0.1]}, "not with controller.kind"),
         ({"observer": {"kind": "kalman", "initial_std": [0.5, 0.5]}}, 'take "luenberger"'),

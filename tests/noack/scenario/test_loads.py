@@ -220,6 +220,10 @@ def test_several_loops_have_loads_of_their_own() -> None:
             {"model": {"load": [[1.0], [0.0]], "hold": ["velocity"]}},
             "no constant input holds velocity at 0 under the load; name other states",
         ),
+        (
+            {"model": {"load": "input", "state_names": ["load", "speed"]}},
+            "load occurs more than once in load, speed, load",
+        ),
         ({"plant": {"load": [1.0]}}, "plant.load = [1.0]: the model has no load; give model.load"),
         ({"model": {"load": "input"}, "plant": {"load": [1.0, 2.0]}}, "expected 1 entries (one per load)"),
         ({"model": {"load": [[1.0, 0.0]]}}, "expected 2 x 2 (one row per state, one column per load)"),
