@@ -358,7 +358,7 @@ def try_likely_patterns(search: PatternSearch, scenario_pattern: Pattern, rng: n
     search.step = "guesses"
     flow, automaton = search.flow, search.automaton
     events = len(follow(flow, automaton, [(False,) * _LONGEST])[1][0])
-    candidates = [scenario_pattern, *_candidates(search.guarantee, events, rng)]
+    candidates = [scenario_pattern, *likely_patterns(search.guarantee, events, rng)]
     values, patterns = follow(flow, automaton, candidates)
     search.nodes += events + sum(map(len, patterns))
     search.runs += len(patterns)
@@ -367,23 +367,17 @@ def try_likely_patterns(search: PatternSearch, scenario_pattern: Pattern, rng: n
     return flow.horizon_s / (events + 1)
 
 
-def _candidates(guarantee: LossGuarantee, events: int, rng: np.random.Generator) -> list[Pattern]:
-    """Return patterns of that many events: without losses, regular ones, random ones."""
-    if guarantee.longest_burst == 0:
-        return [()]
-    share = rng.uniform(size=(_RANDOM, 1))
-    random = rng.uniform(size=(_RANDOM, events)) < share
-    return [(), *regular_patterns(guarantee, events), *(tuple(row) for row in random.tolist())]
+def likely_patterns(guarantee: LossGuarantee, events: int, rng: np.random.Generator) -> list[Pattern]:
+    """Return patterns of that many events: without losses, regular ones, random ones.
 
-
-def regular_patterns(guarantee: LossGuarantee, events: int) -> list[Pattern]:
-    """Return patterns of that many events, each of which loses the first updates of each period.
-
-    With a further constraint, the period may be its window.
+    A regular pattern loses the first updates of each period; with a further constraint, the period
+    may be its window.
     """
     longest = events if guarantee.longest_burst is None else guarantee.longest_burst
+    if longest == 0:
+        return [()]
     lengths = [window.packets for window in guarantee.windows[1:] if window.packets <= _PERIODS]
-    return [
+    regular = [
         tuple((i + phase) % period >= lost for i in range(events))
         for lost in range(1, longest + 1)
         for period in (
@@ -392,6 +386,9 @@ def regular_patterns(guarantee: LossGuarantee, events: int) -> list[Pattern]:
         )
         for phase in range(period)
     ]
+    share = rng.uniform(size=(_RANDOM, 1))
+    random = rng.uniform(size=(_RANDOM, events)) < share
+    return [(), *regular, *(tuple(row) for row in random.tolist())]
 
 
 def improve(search: PatternSearch, pattern: Pattern, value: float, most_nodes: int) -> None:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.analysis.adversary.loop_flows import Objective, Pattern
-from cosim.analysis.adversary.pattern_search import SearchReport, regular_patterns
+from cosim.analysis.adversary.pattern_search import SearchReport, likely_patterns
 from cosim.analysis.adversary.worst_run import WorstRun, reported_value
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
@@ -29,8 +29,6 @@ from noack.theory.certificates.conditions import network_delay_ns
 
 RUNS = 200
 """Runs that are simulated by default, about."""
-_RANDOM_SHARE = 0.25
-"""Share of the runs with random patterns."""
 _GUESSED_SHARE = 0.6
 """Share of the runs before single outcomes are changed."""
 
@@ -72,20 +70,15 @@ def find_worst_by_runs(
     """
     began_s = time.monotonic()
     runs = _PatternRuns(resolved, certificate, objectives, report)
-    own_fates = network_fates(resolved)
-    lossless = runs.of(())
-    events = len(lossless.pattern)
-    own = runs.of(tuple(own_fates(event) for event in range(2 * events)))
-    rng, random = stream(0, "adversary"), round(_RANDOM_SHARE * most_runs)
-    longest = len(runs.of((False,) * 8 * (events + 1)).pattern)  # losses bring more events
-    drawn = rng.uniform(size=(random, longest)) < rng.uniform(size=(random, 1))
-    guesses = [tuple(row) for row in drawn.tolist()]
-    guesses += regular_patterns(resolved.network.guarantee, longest)
-    for pattern in guesses[: round(_GUESSED_SHARE * most_runs)]:
-        runs.of(pattern)
-    share = max(most_runs - len(runs), 0) // len(objectives)
+    lossless, own_fates = runs.of(()), network_fates(resolved)
+    events = len(runs.of((False,) * 8 * (len(lossless.pattern) + 1)).pattern)  # losses bring more events
+    own = runs.of(tuple(own_fates(event) for event in range(events)))
+    for pattern in likely_patterns(resolved.network.guarantee, events, stream(0, "adversary")):
+        if runs.count < _GUESSED_SHARE * most_runs:
+            runs.of(pattern)
+    share = max(most_runs - runs.count, 0) // len(objectives)
     for objective in objectives:
-        runs.improve(objective, until=len(runs) + share)
+        runs.improve(objective, until=runs.count + share)
     found = []
     for objective in objectives:
         worst = runs.worst(objective)
@@ -100,7 +93,7 @@ def find_worst_by_runs(
                 event_s=worst.event_s,
                 exact=math.isinf(value) and value > 0,
                 nodes=runs.events,
-                runs=len(runs),
+                runs=runs.count,
                 lossless=reported_value(lossless.values[objective][0], objective),
                 with_own_network=reported_value(own.values[objective][0], objective),
                 certified=_certified(certificate, objective),
@@ -126,11 +119,9 @@ class _PatternRuns:
         self._outputs = resolved.loop_outputs() if is_bounded else ()
         self._known: dict[Pattern, _PatternRun] = {}
         self._delay_ns = network_delay_ns(resolved, 0)
-        self.events = 0
-        """Of all runs."""
-
-    def __len__(self) -> int:
-        return len(self._known)
+        self._aim = objectives[0]
+        self.count, self.events = 0, 0
+        """The runs, and the events of all of them."""
 
     def of(self, pattern: Pattern) -> _PatternRun:
         """Return the run of a pattern.
@@ -140,9 +131,8 @@ class _PatternRuns:
         if pattern not in self._known:
             run = self._simulated(pattern)
             self._known[pattern] = self._known[run.pattern] = run
-            self.events += len(run.pattern)
-            value = max(values[0] for values in run.values.values())
-            self._report("runs", self.events, value)
+            self.count, self.events = self.count + 1, self.events + len(run.pattern)
+            self._report(self._aim.value, self.events, self.worst(self._aim).values[self._aim][0])
         return self._known[pattern]
 
     def worst(self, objective: Objective) -> _PatternRun:
@@ -156,10 +146,11 @@ class _PatternRuns:
 
     def improve(self, objective: Objective, until: int) -> None:
         """Change single outcomes of the worst run, up to a number of runs or until none makes it worse."""
+        self._aim = objective
         while True:
             worst = self.worst(objective)
             for event, delivered in enumerate(worst.pattern):
-                if len(self) >= until:
+                if self.count >= until:
                     return
                 changed = self.of((*worst.pattern[:event], not delivered, *worst.pattern[event + 1 :]))
                 if changed.values[objective] > worst.values[objective]:

@@ -70,10 +70,6 @@ class LoopTimes(NamedTuple):
         cycle = math.lcm(self.step, self.tick)
         return cycle // math.gcd(cycle, self.period)
 
-    def since_tick(self, t: int) -> int:
-        """Time from the last tick before ``t`` to ``t``, above 0."""
-        return (t - self.phase - 1) % self.tick + 1
-
     def occurrences(self, begin: int, end: int) -> list[tuple[int, bool]]:
         """Return the times of ticks (True) and of the plant's steps (False) in their order.
 
