@@ -71,7 +71,8 @@ class ThresholdTrials:
             changed = resolve(validate(content, self.scenario.name))
         except NoackError:
             return None
-        bounds = find_statement(resolved_content(changed, self.late_periods), self.plants, "schedule").bounds
+        tables = resolved_content(changed, self.late_periods)
+        bounds = find_statement(changed, tables, self.plants, "schedule").bounds
         if bounds is None or name not in bounds.bounds:
             return None
         return min(bounds.bounds[name].constant, bounds.limits.get(name, math.inf))

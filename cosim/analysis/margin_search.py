@@ -283,7 +283,7 @@ class MarginResult:
         """The answer of ``noack certify``, as a line; none if it was not examined."""
         if self.certificate is None:
             return ()
-        return (f"noack certify --no-proofs, for {self.guarantee}: {self.certificate.text}",)
+        return (f"noack certify --no-search, for {self.guarantee}: {self.certificate.text}",)
 
     def to_json(self) -> dict[str, object]:
         """Return all fields and the verdicts for JSON."""

@@ -46,11 +46,12 @@ class WitnessStore:
 
     def __init__(self, loop: Loop | tuple[Loop, Mapping[str, object]]) -> None:
         key = json.dumps([_FORM, _exact(loop)])
-        self._name = hashlib.sha256(key.encode()).hexdigest() + ".json"
+        self.name = hashlib.sha256(key.encode()).hexdigest() + ".json"
+        """The file's name."""
 
     def read(self, wanted: Sequence[str], most_work: float) -> StoredSearch | None:
         """Return what a search for some outputs with this limit of work would find; None: it is not known."""
-        with suppress(*_UNREADABLE), open_regular(_folder() / self._name) as file:
+        with suppress(*_UNREADABLE), open_regular(_folder() / self.name) as file:
             if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
                 return None
             content = json.loads(file.read(_MOST_BYTES))
@@ -66,7 +67,7 @@ class WitnessStore:
         content = found._asdict() | {"noack": version("noack"), "wanted": wanted, "most_work": most_work}
         with suppress(OSError, ValueError, RuntimeError):
             create_folder(folder := _folder(), mode=0o700)
-            with new_file(folder / self._name, mode=0o600) as file:
+            with new_file(folder / self.name, mode=0o600) as file:
                 file.write(json.dumps(content, allow_nan=False).encode())
             _remove_oldest(folder)
 

@@ -25,7 +25,12 @@ from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.witnesses.documents import Witness, find_witness, witness_by_gains
 from noack.theory.witnesses.effort import MOST_WORK, NoWitnessError
 from noack.theory.witnesses.outward import proven_bounds
-from noack.theory.witnesses.regions import PlantOnRegions, find_region_witness, region_table
+from noack.theory.witnesses.regions import (
+    PlantOnRegions,
+    find_region_witness,
+    region_table,
+    region_witness_by_gains,
+)
 from noack_check.check import RejectedError
 from noack_check.equations import read_region
 from noack_check.keys import RefusedError
@@ -84,6 +89,14 @@ class Witnesses(NamedTuple):
         return json.dumps({"scenario": self.scenario, "statements": documents}, allow_nan=False)
 
 
+def plants_of(resolved: Scenario) -> list[str]:
+    """Return the plants of a scenario's statements: "own", or "region" of equations, and "box"."""
+    if not resolved.coverage.is_linear:
+        return ["region"]
+    has_box = resolved.plant.uncertainty_A is not None or resolved.plant.uncertainty_B is not None
+    return ["own", "box"] if has_box else ["own"]
+
+
 def find_witnesses(
     resolved: Scenario,
     late_periods: int,
@@ -103,33 +116,15 @@ def find_witnesses(
         near: documents of similar scenarios.
     """
     content = resolved_content(resolved, late_periods)
-    has_box = resolved.plant.uncertainty_A is not None or resolved.plant.uncertainty_B is not None
-    wanted = [(plants, under) for under in conditions for plants in ("own", *(["box"] if has_box else []))]
+    wanted = [(plants, under) for under in conditions for plants in plants_of(resolved)]
     found: list[WitnessedStatement] = []
     for index, (plants, under) in enumerate(wanted):
         part = partial(_part_of, progress, index, len(wanted))
-        known = []  # the searches of ideal conditions are short
+        known = [*near] if plants == "region" else []  # other searches of ideal conditions are short
         if under == "schedule":
             found_near = (s for s in found if s.plants == plants or s.conditions == under)
-            known = [*near, *(s.document for s in found_near if s.document)]
-        found.append(find_statement(content, plants, under, part, most_work, known))
-    progress(1.0)
-    return Witnesses(content, found)
-
-
-def find_region_witnesses(
-    resolved: Scenario,
-    late_periods: int,
-    progress: Callable[[float], None] = lambda share: None,
-    most_work: float = MOST_WORK,
-    conditions: Sequence[str] = ("ideal", "schedule"),
-    near: Sequence[Mapping[str, object]] = (),
-) -> Witnesses:
-    """Search for witnesses of a plant's equations, as :func:`find_witnesses` for a linear plant."""
-    content, found = resolved_content(resolved, late_periods), []
-    for index, under in enumerate(conditions):
-        part = partial(_part_of, progress, index, len(conditions))
-        found.append(find_region_statement(resolved, content, under, part, most_work, near))
+            known = [*near, *(s.document for s in found_near if s.document and plants != "region")]
+        found.append(find_statement(resolved, content, plants, under, part, most_work, known))
     progress(1.0)
     return Witnesses(content, found)
 
@@ -164,28 +159,46 @@ def resolved_content(resolved: Scenario, late_periods: int) -> dict[str, object]
 
 
 def find_statement(
-    content: dict[str, object],
+    resolved: Scenario,
+    content: Mapping[str, object],
     plants: str,
     conditions: str,
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
     near: Sequence[Mapping[str, object]] = (),
+    longer: Mapping[str, fmpq] | None = None,
 ) -> WitnessedStatement:
     """Search for the witness of one statement of a resolved scenario: its plants and conditions.
 
     The outputs that the scenario states have bounds under the schedule. Where disturbances or noise act, ‖x‖
-    and each output have bounds in the limit t → ∞, too. ``near`` has documents of other statements of the
-    scenario.
+    and each output have bounds in the limit t → ∞, too.
+
+    Args:
+        resolved: the scenario.
+        content: its tables, as :func:`resolved_content` returns them.
+        plants: one of :func:`plants_of`.
+        conditions: "ideal" or "schedule".
+        progress: called with the completed share.
+        most_work: limit of the search; 0: a witness that is known, or one by gains.
+        near: documents of other statements of the scenario.
+        longer: some of the loop's times are at least these, in s.
     """
+    has_outputs = conditions == "schedule"
     try:
-        loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal")
-        has_outputs = conditions == "schedule"
-        witness = known_or_found(loop, progress, most_work, has_outputs=has_outputs, near=near)
-    except (RefusedError, NoWitnessError) as error:
+        if plants == "region":
+            plant = plant_on_regions(resolved, content, conditions, longer)
+            witness, loop = known_or_found_on_region(
+                plant, progress, most_work, has_outputs=has_outputs, near=near
+            )
+        else:
+            loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal", longer=longer)
+            witness = known_or_found(loop, progress, most_work, has_outputs=has_outputs, near=near)
+    except (RefusedError, NoWitnessError, NotEnclosedError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
-    bounds = proven_bounds(witness.proof, loop)
-    return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds)
+    return WitnessedStatement(
+        plants, conditions, document, witness.proof, "", proven_bounds(witness.proof, loop)
+    )
 
 
 def plant_on_regions(
@@ -216,27 +229,6 @@ def plant_on_regions(
     size = float(np.abs(loop.x0).max()) or 1.0
     typical = size * np.concatenate([np.ones(loop.n), np.abs(loop.K).sum(axis=1)])
     return PlantOnRegions((*loop.state_names, *loop.input_names), loop.n, typical, on)
-
-
-def find_region_statement(
-    resolved: Scenario,
-    content: Mapping[str, object],
-    conditions: str,
-    progress: Callable[[float], None] = lambda share: None,
-    most_work: float = MOST_WORK,
-    near: Sequence[Mapping[str, object]] = (),
-) -> WitnessedStatement:
-    """Search for the witness of a plant's equations on a region; see :func:`find_statement`."""
-    try:
-        plant = plant_on_regions(resolved, content, conditions)
-        witness, loop = known_or_found_on_region(
-            plant, progress, most_work, has_outputs=conditions == "schedule", near=near
-        )
-    except (RefusedError, NoWitnessError, NotEnclosedError) as error:
-        return WitnessedStatement("region", conditions, None, None, str(error))
-    document = {"plants": "region", "conditions": conditions, **witness.document}
-    bounds = proven_bounds(witness.proof, loop)
-    return WitnessedStatement("region", conditions, document, witness.proof, "", bounds)
 
 
 def known_or_found(
@@ -295,7 +287,7 @@ def known_or_found_on_region(
 
     def search() -> Witness:
         if not most_work:
-            raise NoWitnessError("no witness was found earlier")
+            return region_witness_by_gains(plant, (*outputs, "e_s", *ultimate))
         return find_region_witness(
             plant, outputs, ultimate=ultimate, near=near, progress=progress, most_work=most_work
         )
@@ -329,7 +321,7 @@ def _known_or_found(
         with suppress(RejectedError, NotEnclosedError):  # it was changed
             return Witness(known.document, proven(known.document))
     if not most_work:
-        return search()
+        return _by_gains(store, wanted, search)
     try:
         witness = search()
     except NoWitnessError as error:
@@ -340,3 +332,23 @@ def _known_or_found(
     bounded = [bound.output if bound.from_start else f"{bound.output} in the limit" for bound in bounds]
     store.write(StoredSearch(witness.document, bounded=bounded), wanted, most_work)
     return witness
+
+
+_found_by_gains = dict[tuple[str, tuple[str, ...]], Witness | str]()
+"""What was found without a search in this process, or why nothing was."""
+_MOST_KEPT = 64
+
+
+def _by_gains(store: WitnessStore, wanted: tuple[str, ...], search: Callable[[], Witness]) -> Witness:
+    """Return what is found without a search; loops with equal numbers share it."""
+    key, known = (store.name, wanted), _found_by_gains
+    if key not in known:
+        if len(known) >= _MOST_KEPT:
+            known.clear()
+        try:
+            known[key] = search()
+        except NoWitnessError as error:
+            known[key] = str(error)
+    if isinstance(found := known[key], str):
+        raise NoWitnessError(found)
+    return found

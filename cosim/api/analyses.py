@@ -9,46 +9,40 @@ from cosim.analysis.mean_cost import MeanCost, find_mean_cost
 from cosim.api.scenarios import Source, load
 from cosim.live.monitoring.progress import work_bar
 from noack.scenario.resolution import resolve
+from noack.theory.witnesses.effort import MOST_WORK
 from noack.theory.witnesses.growth import ACCURACY
 
 
 def certify(
     scenario: Source,
     *,
-    weight: str = "given",
     late: int | None = None,
-    proofs: bool = True,
+    search: bool = True,
     progress: bool = False,
 ) -> Certificates:
-    """Return the certificates of a scenario, with their constants and conditions.
+    """Return the certificates of a scenario: bounds that noack-check has proven, with their conditions.
 
     >>> import noack
-    >>> certificates = noack.certify("double_integrator")
-    >>> certificates.schedule.constants is None  # there is one
-    False
-    >>> certificates.schedule.is_proven("state")  # the bound of ‖x‖
+    >>> certificate = noack.certify("double_integrator").schedule
+    >>> certificate.exists
     True
-
-    If the plant is not linear, the model is certified as the plant, and ``nonlinear`` says so.
+    >>> certificate.state([0.0])[0] < 1.3  # the bound of ‖x‖ at t = 0
+    True
 
     Args:
         scenario: a scenario, or a source that :func:`noack.load` accepts.
-        weight: W of the trigger's norm: ``given`` by the scenario, ``identity``, or ``chosen`` so
-            that more can be certified, which takes some seconds.
         late: plant steps by which the schedule may be late, 0 to 1000; by default the scenario's
             own value.
-        proofs: search for bounds that can be proven, for some seconds, at most some minutes; what is
-            found is kept in the cache folder of the user. Else all bounds are computed only.
+        search: search for the smallest bounds that can be proven, for some seconds, at most some minutes;
+            what is found is kept in the cache folder of the user. Else those that need no search.
         progress: show a progress line on standard error.
 
     Raises:
-        NoackError: the scenario is wrong, or there are no certificates for it: its trigger is not
-            the paper's, its updates are acknowledged, or u is not K x_c.
+        NoackError: the scenario is wrong, or its settings change during the run.
     """
-    certificates = certificates_of(load(scenario), weight, late, of_model=True)
-    if proofs:
-        with work_bar("searching for proofs", lines=True) if progress else nullcontext() as bar:
-            certificates.prove(bar or (lambda share: None))
+    certificates = certificates_of(load(scenario), late)
+    with work_bar("searching for proofs", lines=True) if progress else nullcontext() as bar:
+        certificates.prove(bar or (lambda share: None), MOST_WORK if search else 0.0)
     return certificates
 
 

@@ -44,7 +44,7 @@ def save_tables(result: Result, folder: str | PathLike[str]) -> list[Path]:
         case Run():
             return result.save_tables(folder)
         case Certificates():
-            tables = certificate_report.certificate_tables(result)
+            tables = filter(None, [certificate_report.certificate_table(result)])
         case MarginResult():
             tables = certificate_report.margin_tables(result)
         case MeanCost():

@@ -18,8 +18,6 @@ from noack.scenario.scenario_file import dumps
 from noack.scenario.uneven_periods import uneven_periods
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.conditions import with_stated_times
-from noack.theory.certificates.refusals import refusal_of_steps
-from noack.theory.coverage import refusals
 from noack.trigger_policies.trigger_rule import CodedPolicy
 from plant_server.plant import system_of
 
@@ -80,11 +78,8 @@ def _check_loops(loaded: Scenario, *, json: bool) -> None:
 
 
 def _period_lines(resolved: Scenario) -> Iterator[str]:
-    """Yield the periods that do not divide each other, and why they allow no certificate."""
+    """Yield the periods that do not divide each other."""
     yield from uneven_periods(resolved)
-    why = refusal_of_steps(resolved)
-    if why is not None and not refusals(resolved, "linear"):
-        yield f"no certificate: {why}"
 
 
 def _print_plant(console: Console, resolved: Scenario) -> None:

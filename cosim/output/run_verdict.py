@@ -205,8 +205,8 @@ class GuaranteeVerdict(NamedTuple):
     """From when on it is not."""
     why: str = ""
     """Why it is not; if it is kept, what limits it."""
-    lacks_loop_gain: bool = False
-    """Whether there is no certificate because the loop gain is not below 1."""
+    lacks_certificate: bool = False
+    """Whether there is no certificate."""
 
 
 def guarantee_of(loop: LoopSummary) -> GuaranteeVerdict:
@@ -292,7 +292,7 @@ def _reason(loop: LoopSummary) -> GuaranteeVerdict:
     reason, late = _why(claim), _lateness(loop)
     if late and late[0] == reason:
         reason = f"{reason}; {_what_does_not_cover(loop, claim)}"
-    return GuaranteeVerdict(Tone.DOUBTFUL, claim.since_s or 0.0, reason, claim.lacks_loop_gain)
+    return GuaranteeVerdict(Tone.DOUBTFUL, claim.since_s or 0.0, reason, claim.lacks_certificate)
 
 
 def _what_does_not_cover(loop: LoopSummary, claim: Claim) -> str:
@@ -445,7 +445,7 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{n:,} ({_REJECTIONS.get(reason, reason)})" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
-    if guarantee_of(loop).lacks_loop_gain:
+    if guarantee_of(loop).lacks_certificate:
         yield (
             "no bound of ‖x‖ is certified: noack certify shows what would have to change; "
             "noack margin shows whether a time-triggered loop is proven stable"

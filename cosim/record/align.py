@@ -8,8 +8,7 @@ At each measurement time t:
 * x_c(t) is the controller's last state with a model time t' ≤ t, propagated by e^{H(t−t')};
 * the plant's own state is known at each of its steps, also between measurements
   (:class:`PlantStates`);
-* :func:`identity_residual` compares x_c − x_s with (I1), and :class:`EventFollower` has what is
-  known at the newest event.
+* :func:`identity_residual` compares x_c − x_s with (I1).
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +21,6 @@ from numpy.typing import NDArray
 from cosim.record.rows import concatenate_rows
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.core.linear_systems import Propagator
 from noack.core.references import ModelFlow
 from noack.core.row_operations import all_entries, firsts_of_equal, largest_sizes, row_norms, set_rows
 from noack.protocol.record_tables import (
@@ -351,52 +349,3 @@ def true_states(steps: Rows, t_ns: NDArray[np.int64], column: str = "x") -> Real
         recorded = steps["t_ns"][row] == t_ns
         states[recorded] = steps[column][row[recorded]]
     return states
-
-
-NOT_SHARED = 2**62
-"""Number of missing events where sensor and controller share no update."""
-
-
-class SinceEvent(NamedTuple):
-    """The newest event t_k at each of some times."""
-
-    age_s: Reals
-    """t − t_k, (k,); NaN before the first event."""
-    predicted: Reals
-    """e^{(A+BK)(t−t_k)} x(t_k), with the x that the sensor knows, (k, n); NaN before."""
-    missing: NDArray[np.int64]
-    """Number of events after the newest one that the controller has received, (k,)."""
-
-
-class EventFollower:
-    """Follows the newest event of a run of a resolved scenario."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        loop = loop_of(scenario)
-        self._scenario = scenario
-        self._propagate = Propagator(loop.A + loop.B @ loop.K)
-        # The newest event before the part, and those of the part: number, time, and state.
-        self._events, self._event_ns = np.full(1, NO_SEQUENCE), np.zeros(1, np.int64)
-        self._x = np.full((1, loop.n), np.nan)
-
-    def take(self, rows: Rows, aligned: AlignedRun) -> SinceEvent:
-        """Return what follows from the newest event, at the next measurements."""
-        new = np.flatnonzero(rows["event"] != NO_SEQUENCE)
-        self._events = np.append(self._events[-1:], rows["event"][new])
-        self._event_ns = np.append(self._event_ns[-1:], rows["t_ns"][new])
-        self._x = np.concatenate([self._x[-1:], rows["x"][new]])
-        return self._since(rows["t_ns"], aligned.received, shares_update(self._scenario, aligned))
-
-    def at_steps(self, plant: PlantStates) -> SinceEvent:
-        """Return the same at the plant's steps up to the last of these measurements."""
-        return self._since(plant.t_ns, plant.received, plant.shared)
-
-    @np.errstate(all="ignore")  # a run may diverge
-    def _since(self, t_ns: Times, received: NDArray[np.int64], shared: NDArray[np.bool_]) -> SinceEvent:
-        newest = np.searchsorted(self._event_ns[1:], t_ns, "right")
-        age_ns, period = t_ns - self._event_ns[newest], self._scenario.timing.plant_period
-        states = self._x.take(newest, axis=0)
-        predicted = self._propagate.advance_by(states, age_ns, period.lengths_ns[0])
-        events = self._events[newest]
-        age_s = np.where(events == NO_SEQUENCE, np.nan, age_ns * 1e-9)
-        return SinceEvent(age_s, predicted, np.where(shared, events - received, NOT_SHARED))

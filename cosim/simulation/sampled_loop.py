@@ -22,7 +22,7 @@ from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import network_delay_ns
-from noack.theory.coverage import require_certifiable
+from noack.theory.coverage import require_linear
 from plant_server.plant import disturbance_of, measurement_model_of, plants_of
 from sensor_node.sensor import sensors_of
 
@@ -92,7 +92,7 @@ class SampledLoop:
     def __init__(self, resolved: Scenario) -> None:
         coverage, timing = resolved.coverage, resolved.timing
         coverage.require_unchanging()
-        require_certifiable(resolved, "linear")
+        require_linear(resolved)
         coverage.require_direct_inputs()
         if timing.actuation_timeout_ns <= timing.controller_period_ns + timing.plant_period_ns:
             raise CallerError(

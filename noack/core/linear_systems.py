@@ -20,6 +20,8 @@ from noack.core.core_library import SCRATCH_MATRICES, CData, core, ffi, pointer_
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+Stack = NDArray[np.float64]
+"""Many matrices: those of a stack have the first indices, (…, k, n, r)."""
 
 MatrixKey = tuple[tuple[int, ...], bytes]
 """Shape and bits of a matrix, by which equal matrices are known."""

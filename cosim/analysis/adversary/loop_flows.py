@@ -37,7 +37,7 @@ from cosim.simulation.sampled_loop import Numbers, Runs, SampledLoop, Scales
 from noack.core.core_library import core
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.certified_bounds import Quantity, ScenarioCertificate
 
 _GRAMIAN_POINTS = 12
 """Points of the quadrature (Gauss and Legendre) of the integral over a window."""
@@ -329,10 +329,10 @@ class SampledFlow:
     @property
     def certified(self) -> float | None:
         """The certificate's bound of the objective; None without one."""
-        if self.certificate.constants is None:
-            return None
         if self.objective is Objective.INTER_EVENT:
             return self.certificate.inter_event_s
+        if not self.certificate.has("e_c" if self.objective is Objective.ERROR else "x"):
+            return None
         bound = self._bound(of_error=self.objective is Objective.ERROR)
         if self.objective is Objective.COST:
             return float((bound[1:] ** 2).sum() * self.loop.step_s)
@@ -403,9 +403,10 @@ class SampledFlow:
     def _bound(self, *, of_error: bool) -> Vector:
         """Return the bound of ‖W e_c‖ or of ‖x‖ at each step; 1 without a certificate."""
         t_s = self._time(np.arange(self.loop.last + 1))
-        if self.certificate.constants is None:
+        quantity: Quantity = "e_c" if of_error else "x"
+        if not self.certificate.has(quantity):
             return np.ones(len(t_s))
-        return self.certificate.controller_error(t_s) if of_error else self.certificate.state(t_s)
+        return self.certificate.bound(t_s, quantity)
 
     def _runs(self, t_s: Vector, z: Matrix) -> Runs:
         """Return runs with a copy of states in rows, (N, entries)."""

@@ -42,6 +42,7 @@ from cosim.analysis.adversary.worst_disturbances import (
     worst_disturbances,
 )
 from cosim.analysis.adversary.worst_run import WorstRun, certified_value, reported_value
+from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.simulation.continuous import (
     ContinuousLoop,
     ContinuousRun,
@@ -50,15 +51,11 @@ from cosim.simulation.continuous import (
     simulate_continuous,
 )
 from cosim.simulation.sampled_loop import SampledLoop
-from noack.core.linear_systems import Vector
+from noack.core.linear_systems import Vector, spectral_abscissa
 from noack.core.random_streams import stream
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.bounds.enclosure import NotDecayingError, response
-from noack.theory.bounds.gains import ErrorGains, Output
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
-from noack.theory.certificates.scenario_certificates import certify
+from noack.theory.response_bounds import NotDecayingError, bound_response
 
 NODES = 500_000
 """Most segments that the search through all patterns computes by default."""
@@ -106,15 +103,10 @@ def find_worst(
             threshold becomes too small before the horizon.
     """
     if certificate is None:
-        certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
+        certificate = quick_certificate(resolved, ideal=continuous)
     find = _find_continuous if continuous else _find_sampled
     with np.errstate(all="ignore"):  # a loop that diverges overflows
         return find(resolved, objective, certificate, beam, most_nodes, report)
-
-
-def conditions_of(resolved: Scenario, *, continuous: bool) -> NetworkConditions:
-    """Return the conditions of the search: the schedule without lateness, or the paper's."""
-    return ideal_conditions(resolved) if continuous else nominal_conditions(resolved)
 
 
 def _find_sampled(
@@ -205,9 +197,8 @@ def _find_continuous(
 ) -> WorstRun:
     """Search the paper's loop, and confirm the worst pattern by an exact run."""
     began_s, horizon_s = time.monotonic(), resolved.horizon_s
-    constants = certificate.constants
-    system = continuous_loop_of(resolved)
-    measure = measure_of(system, objective, None if constants is None else constants.rate_per_s)
+    system, proven = continuous_loop_of(resolved), certificate.proven
+    measure = measure_of(system, objective, None if proven is None else proven.rate_per_s)
     known_start = resolved.network.initial_sync == "known_state"
     # The first packet is always delivered and not part of the search.
     first_packet: Pattern = () if known_start else (True,)
@@ -260,10 +251,10 @@ def cost_ceiling(system: ContinuousLoop, longest_burst: int | None, horizon_s: f
 
     From x' = (A+BK) x + B p, p = K e_c, and the triangle inequality in L₂[t, ∞),
 
-        ‖x‖_{L₂} ≤ √(x(t)ᵀ P x(t)) + ∫₀^∞‖e^{(A+BK)s}B U‖ds · ‖p‖_{L₂},  (A+BK)ᵀP + P(A+BK) = −I
+        ‖x‖_{L₂} ≤ √(x(t)ᵀ P x(t)) + ∫₀^∞‖e^{(A+BK)s}B‖ds · ‖p‖_{L₂},  (A+BK)ᵀP + P(A+BK) = −I
 
-    by Young's inequality for the convolution, with K = U R. By identity (I1) every pattern has
-    ‖R e_c‖ ≤ D level(t): D sums the gains of the present e_s and of the longest burst of missed
+    by Young's inequality for the convolution. By identity (I1) every pattern has
+    ‖K e_c‖ ≤ D level(t): D sums the gains of the present e_s and of the longest burst of missed
     ones, at any distance. The bound is cheap and prunes the late part of the search tree. There is
     no comparable bound for suprema: they may occur at any time.
 
@@ -271,17 +262,21 @@ def cost_ceiling(system: ContinuousLoop, longest_burst: int | None, horizon_s: f
     """
     if longest_burst is None:
         return None
-    loop, trigger = system.loop, system.decaying
+    loop, trigger, alpha_per_s = system.loop, system.decaying, system.decaying.rate_per_s
     closed = loop.A + loop.B @ loop.K
-    models = _models(system)
+    weight = weight_of(system)
+    inverse = np.linalg.inv(weight)
+    if spectral_abscissa(loop.H) + alpha_per_s >= 0:
+        alpha_per_s = 0.0
+    growing = loop.H + alpha_per_s * np.eye(loop.n)
     try:
-        missing = models.now(Output.GAIN) + models.missing(Output.GAIN, longest_burst, 0.0)
-        pushed = response(closed, loop.B @ models.split_K[0])
+        pushed = bound_response(closed, np.eye(loop.n), loop.B).integral
+        missed = bound_response(growing, loop.K, inverse).largest
     except NotDecayingError:
         return None
-    gain = pushed.through(np.eye(loop.n)).integral() * missing
+    gain = pushed * (float(np.linalg.norm(loop.K @ inverse, 2)) + longest_burst * missed)
     P = solve_continuous_lyapunov(closed.T, -np.eye(loop.n))
-    rate, beta = 2 * models.alpha_per_s, trigger.level
+    rate, beta = 2 * alpha_per_s, trigger.level
 
     def ceiling(nodes: Nodes) -> Vector:
         x, rest_s = nodes.z[:, : loop.n], horizon_s - nodes.t_s
@@ -291,14 +286,3 @@ def cost_ceiling(system: ContinuousLoop, longest_burst: int | None, horizon_s: f
         return np.asarray((np.sqrt(state_part) + gain * np.sqrt(level)) ** 2)
 
     return ceiling
-
-
-def _models(system: ContinuousLoop) -> ErrorGains:
-    """Return the gains at the threshold's rate if the models decay faster, otherwise at rate 0."""
-    loop, weight = system.loop, weight_of(system)
-    gains = ErrorGains(loop.H, loop.K, weight, system.decaying.rate_per_s)
-    try:
-        gains.missing(Output.GAIN, 1, 0.0)
-    except NotDecayingError:
-        return ErrorGains(loop.H, loop.K, weight, 0.0)
-    return gains

@@ -115,7 +115,7 @@ class _PatternRuns:
     ) -> None:
         self._resolved, self._certificate, self._report = resolved, certificate, report
         self._objectives = objectives
-        is_bounded = certificate.first("state") is not None and resolved.outputs is not None
+        is_bounded = certificate.has("x") and resolved.outputs is not None
         self._outputs = resolved.loop_outputs() if is_bounded else ()
         self._known: dict[Pattern, _PatternRun] = {}
         self._delay_ns = network_delay_ns(resolved, 0)
@@ -241,8 +241,8 @@ def _share(record: RunRecord, row: Sequence[float], bound: ScenarioCertificate) 
 def _bound(certificate: ScenarioCertificate, objective: Objective, t_s: Vector) -> Vector | None:
     """Return the certified bound of ‖x‖ or of ‖e_c‖_W at times (k,); None: there is none."""
     if objective is Objective.STATE:
-        return certificate.state(t_s) if certificate.first("state") is not None else None
-    return certificate.controller_error(t_s) if certificate.first("delta") is not None else None
+        return certificate.state(t_s) if certificate.has("x") else None
+    return certificate.controller_error(t_s) if certificate.has("e_c") else None
 
 
 def _relative_level(certificate: ScenarioCertificate, objective: Objective, t_s: Vector) -> Vector:

@@ -15,8 +15,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.number_format import NONE, at_least, at_most, duration, number
 from noack.guarantee.loss_guarantee import outcome_letters
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.certificate_terms import Constants
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.certified_bounds import Quantity, ScenarioCertificate
 from noack.theory.certificates.conditions import network_delay_ns
 
 BREACH = 1 + 1e-9
@@ -104,26 +103,28 @@ def certified_value(
     certificate: ScenarioCertificate, measure: Measure, horizon_s: float, value: ObjectiveValue
 ) -> float | None:
     """Return the certificate's bound on the same quantity at the same time."""
-    constants, floor = certificate.constants, certificate.floor_constants
-    if constants is None:
-        return None
     if measure.objective is Objective.INTER_EVENT:
         return certificate.inter_event_s
+    quantity: Quantity = "e_c" if measure.objective is Objective.ERROR else "x"
+    if not certificate.has(quantity):
+        return None
     if measure.objective is Objective.COST:
-        until_s = min(horizon_s, certificate.floor_from_s) if floor is not None else horizon_s
-        cost = _square_integral(constants, until_s)
-        return cost if floor is None else cost + floor.state**2 * (horizon_s - until_s)
+        return _square_integral(certificate, horizon_s)
     at_s = np.array([value.at_s or 0.0])
-    level = float(measure.level(at_s)[0])
-    if measure.objective is Objective.STATE:
-        return float(certificate.state(at_s)[0]) / level
-    return float(certificate.controller_error(at_s)[0]) / (level * measure.beta)
+    bound = float(certificate.bound(at_s, quantity)[0]) / float(measure.level(at_s)[0])
+    return bound if quantity == "x" else bound / measure.beta
 
 
-def _square_integral(constants: Constants, until_s: float) -> float:
-    """Return ∫(X e^{−rt})² dt up to ``until_s``."""
-    rate = 2 * constants.rate_per_s
-    return constants.state**2 * (-math.expm1(-rate * until_s) / rate if rate else until_s)
+def _square_integral(certificate: ScenarioCertificate, until_s: float) -> float:
+    """Return ∫(D₁e^{−rt} + D₂)² dt up to ``until_s``."""
+    assert certificate.proven is not None
+    rate, (decaying, constant) = certificate.proven.rate_per_s, certificate.proven.bounds["x"]
+
+    def integral(rate_per_s: float) -> float:
+        return -math.expm1(-rate_per_s * until_s) / rate_per_s if rate_per_s else until_s
+
+    once, twice = integral(rate), integral(2 * rate)
+    return decaying**2 * twice + 2 * decaying * constant * once + constant**2 * until_s
 
 
 def document(
@@ -193,10 +194,7 @@ def print_worst(
     if certificate.void is not None and not certificate.exists:
         console.print(f"[dim]Nothing is certified: {escape(certificate.void)}[/]")
     elif trigger == "sampled":
-        how = "computed for the scenario's schedule, without lateness"
-        if certificate.proven is not None:
-            how = "proved for the scenario's schedule"
-        console.print(f"[dim]certified: {how}[/]")
+        console.print("[dim]certified: proved for the scenario's schedule[/]")
     console.print("[dim]One letter per event: D delivered, L lost. --json prints their times[/]")
 
 
@@ -220,16 +218,12 @@ def _notes(resolved: Scenario, trigger: str) -> Iterator[str]:
 
 
 def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str) -> str:
-    constants, sampled = certificate.constants, trigger == "sampled"
-    alpha = certificate.alpha_per_s
-    rate = 0.0 if sampled or certificate.floor >= certificate.beta else alpha
-    if constants is not None:
-        rate = constants.rate_per_s
-    symbol = "α" if rate == alpha and not sampled else f"{rate:.3g}"
-    growth = f" e^({symbol}t)" if rate else ""
+    sampled = trigger == "sampled"
+    rate = 0.0 if certificate.proven is None else certificate.proven.rate_per_s
+    growth = f" e^({rate:.3g}t)" if rate else ""
     if sampled and _is_shaped(certificate):
         growth = ", scaled"
-    error = "‖W e_c‖" if certificate.weighted else "‖e_c‖"
+    error = "‖W e_c‖"
     return {
         Objective.ERROR: f"{error}{growth}" if sampled else f"Δ: {error}{growth} / β",
         Objective.STATE: f"‖x‖{growth}" if sampled else f"X: ‖x‖{growth}",
@@ -240,8 +234,6 @@ def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: s
 
 def _is_shaped(certificate: ScenarioCertificate) -> bool:
     """Return whether the bounds are not c e^{−rt}."""
-    others = (certificate.persistent_constants, certificate.floor_constants, certificate.other)
-    is_sum = certificate.proven is not None and any(
+    return certificate.proven is not None and any(
         bound.decaying and bound.constant for bound in certificate.proven.bounds.values()
     )
-    return is_sum or any(other is not None for other in others)

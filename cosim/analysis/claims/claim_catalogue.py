@@ -17,9 +17,10 @@ from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from noack.core.linear_systems import Propagator
 from noack.core.number_format import at_most
 from noack.core.row_operations import row_norms
-from noack.theory.certificates.certified_bounds import Constant, ScenarioCertificate, envelope_formula
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import EQUATIONS
 from noack.theory.certificates.output_bounds import OutputBound, escaped, output_bounds
-from noack.theory.coverage import refusals
+from noack.theory.coverage import is_linear_loop
 
 _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
 """Limits of the relative rounding error that is allowed in (I1)."""
@@ -86,8 +87,6 @@ class ClaimDefinition:
     source: str
     """``"certificate"``: it is evaluated for each certificate of the scenario."""
     assumes: str
-    constant: Constant | Literal["inter_event"] | None = None
-    """What of a certificate bounds it: proven or computed; None: it is computed always."""
     needs_ideal_loop: bool = False
     """A run that exceeds the bound does not refute it."""
     to_the_end: bool = False
@@ -100,12 +99,6 @@ class ClaimDefinition:
         """Whether a certificate claims it."""
         return self.source == _CERTIFICATE
 
-    def is_proven(self, certificate: ScenarioCertificate) -> bool:
-        """Whether a certificate has proven this."""
-        if self.constant == "inter_event":
-            return certificate.has_proven_inter_event_time
-        return self.constant is not None and certificate.is_proven(self.constant)
-
 
 def claim(
     statement: str, source: str, assumes: str, *, needs_ideal_loop: bool = False, to_the_end: bool = False
@@ -116,14 +109,10 @@ def claim(
     )
 
 
-def certified(
-    statement: str, constant: Constant | Literal["inter_event"] | None = None, output: str | None = None
-) -> Callable[[BoundFinder], ClaimDefinition]:
+def certified(statement: str, output: str | None = None) -> Callable[[BoundFinder], ClaimDefinition]:
     """Make a function the definition of a claim of certificates."""
     assumes = "the conditions of the certificate"
-    return lambda find: ClaimDefinition(
-        find, statement, _CERTIFICATE, assumes, constant=constant, output=output
-    )
+    return lambda find: ClaimDefinition(find, statement, _CERTIFICATE, assumes, output=output)
 
 
 def norm_text(run: RunEvidence, vector: str) -> str:
@@ -154,12 +143,12 @@ def controller_error_bound(
 ) -> Bound:
     """Return a bound of ‖e_c‖_W at the measurements, by a certificate or without one.
 
-    It is void from a record's first gap. A proven bound is one of the x_c with which the acting input was
-    computed.
+    It is void from a record's first gap. A certificate's bound is one of the x_c with which the acting input
+    was computed.
     """
     here = samples.is_bounded
     if certificate is not None:
-        here = here & run.bounds_controller_error(samples.t_s, of_input=certificate.is_proven("delta"))
+        here = here & run.bounds_controller_error(samples.t_s)
     # Allow for the rounding of x, which matters for a bound of that size.
     slack = run.rounding(samples.aligned.x_norm[here])
     shares = upper_shares(samples.aligned.e_c_norm[here], values[here] + slack)
@@ -263,7 +252,7 @@ def theorem_1_controller_error(run: RunEvidence, samples: Samples, _: None) -> C
     """Theorem 1 with the Δ of the trajectory."""
     scenario = run.record.scenario
     coverage = scenario.coverage
-    is_covered = not refusals(scenario, "linear") and coverage.is_undisturbed and coverage.is_decaying
+    is_covered = is_linear_loop(scenario) and coverage.is_undisturbed and coverage.is_decaying
     if not is_covered or scenario.decaying.floor > 0 or (delta := run.trajectory_delta) is None:
         return ClaimBound()
     level = scenario.decaying.beta * np.exp(-scenario.decaying.alpha_per_s * samples.t_s)
@@ -305,57 +294,37 @@ def theorem_2_state(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
 # What a certificate claims.
 
 
-@certified("the controller's error is bounded", "delta")
+@certified("the controller's error is bounded")
 def controller_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖e_c‖_W from when the plant applies the controller's input on, with the x_c of this input."""
-    if certificate.first("delta") is None:
+    if not certificate.has("e_c"):
         return ClaimBound()
-    formula = envelope_formula(norm_text(run, "e_c"), certificate, "delta")
+    formula = certificate.pattern(norm_text(run, "e_c"), "e_c")
     values, void = certificate.controller_error(samples.t_s), run.violation_of(certificate)
     return ClaimBound(
         controller_error_bound(
-            run, samples, formula, values, certificate.first("delta"), void, certificate=certificate
+            run, samples, formula, values, certificate.first("e_c"), void, certificate=certificate
         ),
         Envelope(f"certified for {certificate.scope}", "e_c", samples.t_s, values),
-    )
-
-
-@certified("the controller's error is bounded by the events it misses")
-def controller_error_from_events(
-    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate
-) -> ClaimBound:
-    """‖e_c‖_W, given the number of missing events."""
-    bounds, since = run.known_state_bounds(certificate), samples.since_event
-    if bounds is None or since is None:
-        return ClaimBound()
-    values = bounds.controller_error(samples.t_s, since.missing)
-    growth = "‖e^((H+αI)τ)‖" if run.record.loop.weight is None else "‖W e^((H+αI)τ) W⁻¹‖"
-    missing = f"(1 + Σ_(i<j) sup_(τ≥iδ) {growth}) β̃e^(−αt), j events missing"
-    formula = f"{norm_text(run, 'e_c')} ≤ {missing}"
-    void = run.violation_of(certificate)
-    label = "bound, given the updates missing now"
-    return ClaimBound(
-        controller_error_bound(run, samples, formula, values, void=void, certificate=certificate),
-        Envelope(label, "e_c", samples.t_s, np.where(samples.is_bounded, values, np.nan)),
     )
 
 
 @certified("the estimation error is bounded")
 def estimation_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖x̂ − x‖_W at the measurements."""
-    scenario, loop = run.record.scenario, run.record.loop
-    if scenario.coverage.knows_state or certificate.first("estimation_error") is None:
+    loop = run.record.loop
+    if not certificate.has("estimate"):
         return ClaimBound()
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     here, void = samples.with_x, run.violation_of(certificate)
     t_s = samples.t_s[here]
     errors = row_norms((samples.aligned.x - samples.true_x).compress(here, axis=0) @ weight.T)
-    formula = envelope_formula(norm_text(run, "x̂ − x"), certificate, "estimation_error")
-    shares = upper_shares(errors, certificate.estimation_error(t_s))
-    return ClaimBound(Bound(formula, t_s, shares, void, certificate.first("estimation_error")))
+    formula = certificate.pattern(norm_text(run, "x̂ − x"), "estimate")
+    shares = upper_shares(errors, certificate.bound(t_s, "estimate"))
+    return ClaimBound(Bound(formula, t_s, shares, void, certificate.first("estimate")))
 
 
-@certified("minimum inter-event time", "inter_event")
+@certified("minimum inter-event time")
 def inter_event_time(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """The time between two events."""
     if certificate.inter_event_s is None:
@@ -364,29 +333,29 @@ def inter_event_time(run: RunEvidence, samples: Samples, certificate: ScenarioCe
     return least_inter_event_time(run, samples, certificate.inter_event_s, void, label, certificate)
 
 
-@certified("the sensor's error is bounded", "overshoot")
+@certified("the sensor's error is bounded")
 def sensor_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖e_s‖_W before each reset."""
-    if certificate.first("overshoot") is None:
+    if not certificate.has("e_s"):
         return ClaimBound()
-    formula = envelope_formula(norm_text(run, "e_s"), certificate, "overshoot")
+    formula = certificate.pattern(norm_text(run, "e_s"), "e_s")
     slack = run.rounding(samples.aligned.x_norm)
     shares = upper_shares(samples.aligned.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
     void = run.violation_of(certificate)
-    return ClaimBound(Bound(formula, samples.t_s, shares, void, certificate.first("overshoot")))
+    return ClaimBound(Bound(formula, samples.t_s, shares, void, certificate.first("e_s")))
 
 
-@certified("the state is bounded", "state")
+@certified("the state is bounded")
 def state(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖x‖ at each step of the plant."""
-    if certificate.first("state") is None:
+    if not certificate.has("x"):
         return ClaimBound()
-    formula = envelope_formula("‖x‖", certificate, "state")
+    formula = certificate.pattern("‖x‖", "x")
     values, slack = certificate.state(samples.step_s), ROUNDING * run.offset
     shares = upper_shares(row_norms(samples.plant.x), values + slack)
     void = run.violation_of(certificate)
     return ClaimBound(
-        Bound(formula, samples.step_s, shares, void, certificate.first("state")),
+        Bound(formula, samples.step_s, shares, void, certificate.first("x")),
         Envelope(f"certified for {certificate.scope}", "x", samples.step_s, values),
     )
 
@@ -415,7 +384,7 @@ def _output_claim(
     """Return the claim of an output's bound, or that it stays within its allowed error from a time on."""
     output, certificate = output_bound.output, output_bound.certificate
 
-    @certified(statement, "state", output.name)
+    @certified(statement, output.name)
     def output_claim(run: RunEvidence, samples: Samples, of_loop: ScenarioCertificate) -> ClaimBound:
         observed = np.abs(samples.plant.x @ np.array(output.row))
         slack, t_s = ROUNDING * run.offset, samples.step_s
@@ -426,7 +395,7 @@ def _output_claim(
             limit = f"{escaped(output_bound.symbol)} ≤ {{}} {escaped(output.unit)}".rstrip()
             formula = f"{limit} from {at_most(settles_s, 3)} s on"
             return ClaimBound(Bound(formula, t_s[later], shares, void, output.allowed))
-        values, first = certificate.state(t_s), certificate.first("state")
+        values, first = certificate.state(t_s), certificate.first("x")
         return ClaimBound(
             Bound(output_bound.pattern, t_s, upper_shares(observed, values + slack), void, first),
             Envelope(f"certified for {of_loop.scope}", output.distance, t_s, values),
@@ -437,50 +406,25 @@ def _output_claim(
 
 @certified("x stays in the region")
 def region(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
-    """The region of a nonlinear plant, coordinate by coordinate."""
-    names, x = run.record.loop.state_names, np.abs(samples.plant.x)
-    if certificate.proven is not None and (entries := certificate.proven.entries(len(names), 0)):
-        proven = certificate.proven
-        limits = {i: proven.at(f"x[{i}]", samples.step_s) for i in entries}
-        formulas = {i: proven.formula(f"|{names[i]}|", f"x[{i}]") for i in entries}
-        formula = ", ".join(formulas[i].format(at_most(entries[i].first)) for i in entries)
-    elif certificate.region is not None:
-        limits = {i: np.full(len(x), width) for i, width in enumerate(certificate.region.x)}
-        formula = ", ".join(f"|{names[i]}| ≤ {at_most(limit[0])}" for i, limit in limits.items())
-    else:
+    """The region on which a plant's equations are enclosed, coordinate by coordinate."""
+    names, x, proven = run.record.loop.state_names, np.abs(samples.plant.x), certificate.proven
+    entries = {} if proven is None or certificate.scope != EQUATIONS else proven.entries(len(names), 0)
+    if proven is None or not entries:
         return ClaimBound()
+    limits = {i: proven.at(f"x[{i}]", samples.step_s) for i in entries}
+    formulas = {i: proven.formula(f"|{names[i]}|", f"x[{i}]") for i in entries}
+    formula = ", ".join(formulas[i].format(at_most(entries[i].first)) for i in entries)
     shares = np.max([x[:, i] / limit for i, limit in limits.items()], axis=0)
     return ClaimBound(Bound(formula, samples.step_s, shares, run.violation_of(certificate)))
 
 
-@certified("the state is bounded from the newest event on")
-def state_from_events(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
-    """‖x‖ from the newest event on, at which the sensor knows x."""
-    bounds, since, t_s = run.known_state_bounds(certificate), samples.since_event_at_steps, samples.step_s
-    if bounds is None or since is None:
-        return ClaimBound()
-    most = bounds.state_deviation(t_s, since.age_s, run.missing_events(t_s, since, bounds))
-    predicted = row_norms(since.predicted)
-    here = ~np.isnan(since.age_s)
-    deviation = row_norms((samples.plant.x - since.predicted).compress(here, axis=0))
-    shares = upper_shares(deviation, most[here] + run.rounding(predicted[here]))
-    formula = "‖x − e^((A+BK)(t−t_k)) x(t_k)‖ ≤ ∫‖e^((A+BK)s) B‖ ‖u − Kx‖ds, since the event t_k"
-    values = np.fmin(predicted + most, certificate.state(t_s))
-    return ClaimBound(
-        Bound(formula, t_s[here], shares, run.violation_of(certificate)),
-        Envelope("bound, given x at the last event", "x", t_s, values),
-    )
-
-
 CLAIMS = (
     controller_error,
-    controller_error_from_events,
     estimation_error,
     inter_event_time,
     sensor_error,
     state,
     region,
-    state_from_events,
     i1_controller_error,
     i1_model_difference,
     paper_error_bound,

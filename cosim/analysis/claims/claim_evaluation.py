@@ -19,7 +19,7 @@ import numpy as np
 from cosim.analysis.claims.claim_catalogue import CLAIMS, Bound, ClaimDefinition, Envelope, output_claims
 from cosim.analysis.claims.common_end import common_end_ns, up_to_common_end
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
-from cosim.analysis.claims.reference_deviations import deviations, start_error
+from cosim.analysis.claims.reference_deviations import deviations
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from cosim.analysis.summary.summary_model import NO_BOUND, Claim, ClaimVerdict, ViolationPart
 from cosim.record.decimation import decimate
@@ -31,12 +31,8 @@ from noack.core.number_format import at_least, at_most
 from noack.core.references import Reference
 from noack.scenario.loads import first_load_change_s
 from noack.scenario.resolution import loop_of
-from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import BOX, OWN_PLANT, jump_s
-from noack.theory.certificates.refusals import refusals_about_reference
-from noack.theory.certificates.scenario_certificates import outside_box
-from noack.theory.coverage import refusal, refusals
+from noack.theory.certificates.conditions import BOX, NetworkConditions, jump_s, outside_box
 
 _IDEAL_LOOP = "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"
 _ACKNOWLEDGED = (
@@ -61,7 +57,6 @@ class ClaimCheck:
         source: of the claim.
         until_s: end of the claim.
         unmet: an assumption that the run cannot meet.
-        proved: of the claim of a certificate: whether the checker has proven it.
     """
 
     def __init__(
@@ -70,11 +65,8 @@ class ClaimCheck:
         source: str,
         until_s: float,
         unmet: str = "",
-        *,
-        proved: bool | None = None,
     ) -> None:
         self._claimed, self._source, self.until_s, self._unmet = claimed, source, until_s, unmet
-        self._proved = proved
         self._ratio: float | None = None
         self._exceeded_s: float | None = None
         self._bound: Bound | None = None
@@ -130,7 +122,8 @@ class ClaimCheck:
             what=self._claimed.statement, source=self._source, bound=bound.formula.format(text),
             certified=constant, observed=observed, ratio=ratio, verdict=verdict,
             since_s=since_s, why=why,
-            until_s=round(self.until_s, 9) if math.isfinite(self.until_s) else None, proved=self._proved,
+            until_s=round(self.until_s, 9) if math.isfinite(self.until_s) else None,
+            proved=self._claimed.is_certified or None,
             output=self._claimed.output,
         )  # fmt: skip
 
@@ -205,16 +198,12 @@ class RunClaims:
         if (reference := self._reference) is None:
             return self.evidence
         moved = deviations(self._checked_record, reference)
-        error = None
-        if reference.is_constant and reference.input(0).any():  # the input is 0 at first, and not u_r
-            error = start_error(moved, self._evidence(moved).started_s)
-        return self._evidence(moved, None, error, largest_reference(reference, self.record.scenario))
+        return self._evidence(moved, None, largest_reference(reference, self.record.scenario))
 
     def _evidence(
         self,
         record: RunRecord,
         certificates: Sequence[ScenarioCertificate] | None = None,
-        error: float | None = None,
         offset: float = 0.0,
     ) -> RunEvidence:
         changes = [change.first_ns for change in changes_of(self._checked_record) if change.touches_claims]
@@ -222,9 +211,7 @@ class RunClaims:
         if record is not self._checked_record and (at_s := jump_s(self.record.scenario)) is not None:
             until_s = min(until_s, at_s)
         until_s = min(until_s, first_load_change_s(self.record.scenario))
-        void = refusals_about_reference(self.record.scenario, knows_inputs=True)
-        whole, most_work = self.record, self.most_work
-        return RunEvidence(record, whole, until_s, error, void, certificates, offset, most_work)
+        return RunEvidence(record, self.record, until_s, certificates, offset, self.most_work)
 
     @property
     def _is_evaluated(self) -> bool:
@@ -239,7 +226,7 @@ class RunClaims:
     @property
     def allowed(self) -> NetworkConditions | None:
         """The conditions of the scenario's certificates; None if it can have none."""
-        return None if refusals(self.record.scenario) else self.evidence.allowed
+        return None if self.record.scenario.protocol.acknowledges else self.evidence.allowed
 
     @property
     def certified_for(self) -> NetworkConditions | None:
@@ -257,8 +244,6 @@ class RunClaims:
         if self.record.scenario.protocol.acknowledges:
             return [void_claim("x_c − x_s is the sum of the missed jumps", "(I1)", _ACKNOWLEDGED)]
         claims: list[Claim] = []
-        if (uncovered := refusal(self.record.scenario)) is not None:
-            claims.append(void_claim(f"a certificate for {OWN_PLANT}", "certificate", uncovered))
         for certificate in (None, *self.certified_evidence.certificates):
             if certificate is not None and not certificate.exists:
                 claimed = f"a certificate for {certificate.scope}"
@@ -293,8 +278,7 @@ class RunClaims:
             outside = outside_box(certified.record.scenario) if certificate.scope == BOX else None
             for claim in (*output_claims(certified, certificate), *CLAIMS):
                 if claim.is_certified:
-                    proved = claim.is_proven(certificate)
-                    check = ClaimCheck(claim, certificate.source, certified.until_s, proved=proved)
+                    check = ClaimCheck(claim, certificate.source, certified.until_s)
                     yield _ClaimInstance(claim, certified, check, [], certificate, outside)
         for claim in CLAIMS:
             if not claim.is_certified:

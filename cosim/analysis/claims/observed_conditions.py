@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from noack.guarantee.loss_guarantee import LongestBurst, LossRule
 from noack.runtime.host_clocks import RECEIVED, causality_text
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.certificates.conditions import ideal_conditions
-from noack.theory.coverage import refusals
+from noack.theory.certificates.conditions import NetworkConditions, ideal_conditions
+from noack.theory.coverage import is_papers_loop
 
 _TOLERANCE_S = 1e-9
 """Times in seconds have rounding errors below this."""
@@ -144,7 +143,7 @@ def worst_time(t_s: float, worst_at_s: float | None) -> str:
 
 
 class ObservedConditions(NamedTuple):
-    """The conditions of :class:`noack.theory.bounds.certificate_terms.NetworkConditions`, as observed."""
+    """The conditions of :class:`noack.theory.certificates.conditions.NetworkConditions`, as observed."""
 
     losses: PacketLosses
     """Updates that the controller never received, or received too late."""
@@ -280,7 +279,7 @@ def causes_of(scenario: Scenario) -> Collection[str]:
     """
     if scenario.protocol.acknowledges:
         return ()
-    if refusals(scenario):
+    if not is_papers_loop(scenario):
         return ("sampling", *CLOCK_CAUSES)
     return (*guarantee_causes(scenario), *CAUSES)
 

@@ -2,13 +2,14 @@
 
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.analysis.certificates import theorem_2_of
 from cosim.analysis.claims.common_end import common_end_ns
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.observed_conditions import (
@@ -16,7 +17,6 @@ from cosim.analysis.claims.observed_conditions import (
     AssumptionViolation,
     ObservedConditions,
     Reals,
-    SampledSeries,
     VoidFrom,
     causes_of,
     earliest,
@@ -24,16 +24,9 @@ from cosim.analysis.claims.observed_conditions import (
 )
 from cosim.analysis.claims.run_certificates import certificates_under, scheduled_certificates
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
+from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.analysis.summary.signal_statistics import SampleFacts, signal_statistics
-from cosim.record.align import (
-    NOT_SHARED,
-    AlignedRun,
-    EventFollower,
-    PlantStates,
-    SinceEvent,
-    aligned_parts,
-    bounded_parts,
-)
+from cosim.record.align import AlignedRun, PlantStates, aligned_parts, bounded_parts
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NEVER_NS
@@ -41,21 +34,10 @@ from noack.core.row_operations import all_entries
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.runtime_parameters import SETPOINT
-from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.certificates.certified_bounds import (
-    KnownStateBounds,
-    ScenarioCertificate,
-    known_state_bounds,
-)
-from noack.theory.certificates.conditions import (
-    about_reference,
-    allowed_conditions,
-    ideal_conditions,
-    nominal_conditions,
-)
-from noack.theory.certificates.scenario_certificates import certify
-from noack.theory.coverage import refusals
-from noack.theory.paper import Theorem2, theorem_2
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import NetworkConditions, allowed_conditions, nominal_conditions
+from noack.theory.coverage import is_linear_loop
+from noack.theory.paper import Theorem2
 
 ROUNDING = 1e-9
 """Relative rounding error of an exact computation over a run of 10,000 steps."""
@@ -84,10 +66,6 @@ class Samples:
     """x of the plant at each of its steps, (j, n)."""
     inter_event_s: tuple[Reals, Reals]
     """Times of the events, without the run's first, and the times since the event before."""
-    since_event: SinceEvent | None
-    """At the measurements; None if no certificate has bounds from the newest event."""
-    since_event_at_steps: SinceEvent | None
-    """At the plant's steps."""
 
     @cached_property
     def t_s(self) -> Reals:
@@ -118,36 +96,25 @@ class RunEvidence:
     """That of the whole run, if it is another one."""
     until_s: float = math.inf
     """End of what certificates claim: the first change of a setting on which they depend."""
-    start_error: float | None = None
-    """‖u − Kx‖, scaled, until the plant applied the first input; None if u was 0 as certificates assume."""
-    void: Mapping[str, str] = field(default_factory=dict)
-    """By scope: why there is no certificate."""
     scheduled: Sequence[ScenarioCertificate] | None = None
     """The certificates under the scenario's schedule, if they are known."""
     offset: float = 0.0
     """‖x_r‖ of the set-point: x in deviations has the rounding errors of x."""
     most_work: float = 0.0
     """Limit of the search for a witness; 0: only those are used that are known."""
-    _known_states: dict[int, KnownStateBounds | None] = field(default_factory=dict, init=False)
-    """Bounds from the newest event that are known already, by the ``id`` of their certificate."""
     _violations: dict[int, VoidFrom | None] = field(default_factory=dict, init=False)
     """First violations that are known already, by the ``id`` of the certificate."""
 
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
-        scenario = self.record.scenario
-        last_ns, follower = np.zeros(0, np.int64), None
-        if any(map(self.known_state_bounds, self.certificates)):
-            follower = EventFollower(scenario)
+        last_ns = np.zeros(0, np.int64)
         for part, bounded, both, residual in bounded_parts(self.record):
             rows, aligned = part.rows, part.aligned
             event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])
             passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
             last_ns = event_ns[-1:]
             true_x = aligned.x if part.true_x is None else part.true_x
-            since = None if follower is None else follower.take(rows, aligned)
-            at_steps = None if follower is None else follower.at_steps(part.plant)
-            yield Samples(aligned, bounded, both, residual, true_x, part.plant, passed, since, at_steps)
+            yield Samples(aligned, bounded, both, residual, true_x, part.plant, passed)
 
     @cached_property
     def lost_in_rounding(self) -> VoidFrom | None:
@@ -182,10 +149,7 @@ class RunEvidence:
         """The certificates under the scenario's schedule."""
         if self.scheduled is not None:
             return self.scheduled
-        whole_record = self.whole_record or self.record
-        return scheduled_certificates(
-            self.record.scenario, self.start_error, whole_record.scenario, self.most_work
-        )
+        return scheduled_certificates((self.whole_record or self.record).scenario, self.most_work)
 
     @cached_property
     def late(self) -> Sequence[ScenarioCertificate] | None:
@@ -202,23 +166,14 @@ class RunEvidence:
             return None
         if not any(certificate.exists for certificate in self._scheduled):
             return None
-        stated, moved, most_work = whole_record.scenario, self.record.scenario, self.most_work
-        if stated.controller.reference is not None:  # u_r of an older input differs by more
-            moved = about_reference(stated, hold_s=widest.hold_s).model_copy(update={"changes": ()})
-        certificates = certificates_under(widest, moved, self.start_error, stated, most_work=most_work)
+        certificates = certificates_under(widest, whole_record.scenario, self.most_work)
         return certificates if any(certificate.exists for certificate in certificates) else None
 
     @cached_property
     def certificates(self) -> list[ScenarioCertificate]:
         """The certificates of the run: those of its scenario, or of its lateness, where there are some."""
-        certificates = []
-        for scheduled, late in zip(self._scheduled, self.late or self._scheduled, strict=True):
-            used = late if late.exists else scheduled
-            if scheduled.scope in self.void:
-                void = self.void[scheduled.scope]
-                used = replace(scheduled, constants=None, floor_constants=None, proven=None, void=void)
-            certificates.append(used)
-        return certificates
+        pairs = zip(self._scheduled, self.late or self._scheduled, strict=True)
+        return [late if late.exists else scheduled for scheduled, late in pairs]
 
     @property
     def certified_for(self) -> NetworkConditions | None:
@@ -228,22 +183,12 @@ class RunEvidence:
         return late[0] if late else None
 
     @cached_property
-    def _as_read(self) -> ObservedConditions:
-        return read_conditions(self.record)
-
-    @cached_property
     def observed(self) -> ObservedConditions:
         """The conditions under which the run took place."""
-        conditions = self._as_read
-        if self.start_error is None:
+        conditions = read_conditions(self.record)
+        if self.whole_record is None or not self.offset:
             return conditions
-        # The certificate's start error covers the inputs before the first one of the controller.
-        safe = conditions.safe_input
-        later = safe.t_s >= conditions.start_s
-        return conditions._replace(
-            start_s=0.0 if np.isfinite(conditions.start_s) else conditions.start_s,
-            safe_input=SampledSeries(safe.t_s[later], safe.value[later]),
-        )
+        return conditions._replace(safe_input=read_conditions(self.whole_record).safe_input)  # in deviations
 
     @cached_property
     def largest_observed(self) -> dict[str, float | None]:
@@ -253,20 +198,19 @@ class RunEvidence:
     @property
     def started_s(self) -> float:
         """When the plant applied the first input of the controller; infinite if never."""
-        return self._as_read.start_s
+        return self.observed.start_s
 
-    def bounds_controller_error(self, t_s: Reals, *, of_input: bool = False) -> NDArray[np.bool_]:
+    def bounds_controller_error(self, t_s: Reals) -> NDArray[np.bool_]:
         """Return where the certificates bound e_c, (k,).
 
-        The plant applies the controller's input, and x_c has every update with which it was computed; with
-        ``of_input`` no other one.
+        The plant applies the controller's input, and x_c has every update with which it was computed, and
+        no other one.
         """
         is_bounded = t_s >= self.started_s - 1e-9
-        acts_s, reset_s = map(np.sort, self._as_read.early)
+        acts_s, reset_s = map(np.sort, self.observed.early)
         is_bounded &= np.searchsorted(acts_s, t_s, "right") <= np.searchsorted(reset_s, t_s, "right")
-        if of_input:
-            reset_s, acts_s = map(np.sort, self._as_read.waiting)
-            is_bounded &= np.searchsorted(reset_s, t_s, "right") <= np.searchsorted(acts_s, t_s, "right")
+        reset_s, acts_s = map(np.sort, self.observed.waiting)
+        is_bounded &= np.searchsorted(reset_s, t_s, "right") <= np.searchsorted(acts_s, t_s, "right")
         return np.asarray(is_bounded)
 
     def violations(self) -> list[AssumptionViolation]:
@@ -327,50 +271,19 @@ class RunEvidence:
             known[id(certificate)] = None if first is None else VoidFrom(first.t_s, first.text)
         return known[id(certificate)]
 
-    def missing_events(self, t_s: Reals, since: SinceEvent, bounds: KnownStateBounds) -> NDArray[np.int64]:
-        """Return how many events are missing in the input since the newest event, at times t, (k,).
-
-        The bounds assume that an update acts within their delay. Where the plant applied its first
-        input later than that, the number is unknown until then.
-        """
-        event_s = t_s - since.age_s
-        early = event_s + bounds.delay_s < self.started_s - 1e-9
-        return np.asarray(np.where(early, NOT_SHARED, since.missing))
-
-    def known_state_bounds(self, certificate: ScenarioCertificate) -> KnownStateBounds | None:
-        """Return the bounds from the newest event of a certificate; None if it has none."""
-        if certificate.constants is None:
-            return None
-        known = self._known_states
-        if id(certificate) not in known:
-            known[id(certificate)] = known_state_bounds(self.record.scenario, certificate)
-        return known[id(certificate)]
-
     @cached_property
     def allowed(self) -> NetworkConditions:
         """The conditions of the scenario's certificates."""
-        allowed = allowed_conditions(self.record.scenario)
-        return allowed if self.start_error is None else allowed._replace(start_s=0.0)
+        return allowed_conditions(self.record.scenario)
 
     @cached_property
     def _nominal(self) -> NetworkConditions:
-        scenario, is_allowed = self.record.scenario, self.start_error is None
-        is_allowed &= not scenario.certificate.late_periods
-        return self.allowed if is_allowed else nominal_conditions(scenario)
+        return nominal_conditions(self.record.scenario)
 
     @cached_property
     def theorem_2(self) -> Theorem2 | None:
-        """Theorem 2 with (I1)'s uniform Δ under the paper's conditions; None if there is no Δ."""
-        scenario, loop = self.record.scenario, self.record.loop
-        if (
-            refusals(scenario, "linear")
-            or not scenario.coverage.is_undisturbed
-            or not scenario.coverage.is_decaying
-            or loop.weight is not None
-            or scenario.decaying.floor > 0
-        ):
+        """Theorem 2 with a proven Δ under the paper's conditions; None if there is none."""
+        scenario = self.record.scenario
+        if not is_linear_loop(scenario):
             return None
-        ideal, trigger = certify(scenario, ideal_conditions(scenario)).constants, scenario.decaying
-        if ideal is None or ideal.rate_per_s != trigger.alpha_per_s:
-            return None
-        return theorem_2(loop, trigger.beta, trigger.alpha_per_s, ideal.delta)
+        return theorem_2_of(scenario, quick_certificate(scenario, ideal=True))

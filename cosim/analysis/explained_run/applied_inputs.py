@@ -19,7 +19,7 @@ from noack.protocol.record_tables import (
     PLANT_ACTUATION,
     PLANT_STEP,
 )
-from noack.theory.bounds.certificate_terms import NetworkConditions
+from noack.theory.certificates.conditions import NetworkConditions
 
 Numbers = NDArray[np.int64]
 INPUTS = "applied inputs"

@@ -15,9 +15,8 @@ from cosim.analysis.explained_run.plant_flow import check_measurements, check_ob
 from cosim.analysis.explained_run.sensor_events import check_events
 from cosim.record.run_record import RunRecord
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.certificates.conditions import nominal_conditions
-from noack.theory.coverage import refusals
+from noack.theory.certificates.conditions import NetworkConditions, nominal_conditions
+from noack.theory.coverage import is_papers_loop
 
 _CHECKS = (
     check_plant, check_measurements, check_observer, check_events, check_updates, check_controller,
@@ -54,7 +53,7 @@ def states_schedule(resolved: Scenario) -> bool:
     directions = [network.link] + ([] if network.actuation is None else [network.actuation.link])
     stated_s = resolved.certificate.network_delay_s
     return (
-        not refusals(resolved)
+        is_papers_loop(resolved)
         and network.enforce_mansd
         and all(link.delay_is_bounded for link in directions)
         and (stated_s is None or stated_s >= network.link.longest_delay_s)

@@ -250,8 +250,8 @@ class Claim(SummaryPart):
     """The claim ends here, at the first change of a setting on which it depends; None: at the end of
     the run."""
     proved: bool | None = None
-    """Whether the checker has proven the bound of a certificate, or it is computed only; None: it follows
-    from the definitions of the loop, or there is no bound."""
+    """Whether the checker has proven the bound of a certificate; runs of earlier versions have computed
+    ones. None: it follows from the definitions of the loop, or there is no bound."""
     output: Text | None = None
     """The output that is bounded, by its name; None: something else is."""
 
@@ -273,9 +273,9 @@ class Claim(SummaryPart):
         return self.bound != NO_BOUND
 
     @property
-    def lacks_loop_gain(self) -> bool:
-        """Whether there is no certificate because the loop gain is not below 1."""
-        return not self.has_bound and self.why.startswith("the loop gain")
+    def lacks_certificate(self) -> bool:
+        """Whether there is no certificate."""
+        return self.is_certified and not self.has_bound
 
     @property
     def bounds_norm(self) -> bool:

@@ -92,8 +92,9 @@ def design(
         Option(help="Conditions of the certificates: the `paper`'s, or the scenario's `schedule`."),
     ] = CertificateConditions.PAPER,
     weights: Annotated[
-        str, Option(help="Norms to try: `identity`, `given` in the scenario, `chosen` by noack.")
-    ] = "identity,chosen",
+        str,
+        Option(help="Norms to try: `identity`, `given` in the scenario, or `contracting` along the models."),
+    ] = "identity,contracting",
     gain: Annotated[
         DesignGain, Option(help="Gain K: `given` in the scenario, or `lqr` of the nominal model.")
     ] = DesignGain.GIVEN,
@@ -214,8 +215,7 @@ def design(
     loaded.require_decaying()
     norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
     regulator = cost_weights(loaded, Q, R) if gain is DesignGain.LQR else None
-    with work_bar("choosing norms", lines=True) as bar:
-        families = families_of(loaded, norms, regulator, bar)
+    families = families_of(loaded, norms, regulator)
     with work_bar("trying candidates", lines=True) as bar:
         result = design_search.design(families, limits, draws=draws, seed=seed, progress=bar)
     page = page or DEFAULT_RUNS / "design" / f"{loaded.name}.html"

@@ -22,19 +22,11 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-class NormName(StrEnum):
-    """The norm in which ``noack certify`` certifies."""
-
-    GIVEN = "given"
-    IDENTITY = "identity"
-    CHOSEN = "chosen"
-
-
 @app.command(
     rich_help_panel=THEORY,
     epilog=examples(
         ("noack certify lane_following", "its plant, and all plants of its uncertainty box"),
-        ("noack certify lane_following --weight chosen", "with a norm that certifies more"),
+        ("noack certify lane_following --verbose", "every bound, setting and assumption"),
         ("noack certify lane_weighted --late 6 --json", "allow 6 steps of lateness"),
         ("noack certify lane_following --witness lane.json", "for the program noack-check"),
         ("noack certify lane_following --require certificate", "exit status 1 if there is none"),
@@ -45,10 +37,6 @@ def certify(
     settings: opt.SetOption = None,
     network: opt.NetworkOption = None,
     loop: opt.LoopOption = None,
-    weight: Annotated[
-        NormName,
-        Option(help="Norm of the trigger: `given` in the scenario, `identity`, or `chosen` by noack."),
-    ] = NormName.GIVEN,
     late: Annotated[
         int | None,
         Option(
@@ -80,29 +68,25 @@ def certify(
             "noack-check.",
         ),
     ] = None,
-    proofs: Annotated[
-        bool, Option(help="Search for bounds that can be proven; else all bounds are computed only.")
+    search: Annotated[
+        bool,
+        Option(
+            help="Search for the smallest bounds that can be proven, for seconds, at most some minutes; else "
+            "those that need no search, in a second or two."
+        ),
     ] = True,
     verbose: Annotated[
-        bool, Option("--verbose", help="Print all tables: constants, limits, assumptions.")
+        bool, Option("--verbose", help="Print every bound, the largest settings and the assumptions.")
     ] = False,
     json: opt.JsonOption = False,
 ) -> int:
-    """Compute the bounds that are guaranteed for a scenario, and their conditions.
+    """Prove the bounds that are guaranteed for a scenario, and print their conditions.
 
-    If there are none for the given norm, those of a norm that noack chooses follow, with the lines
-    for the scenario file. If the plant is not linear, the model is certified as the plant.
+    Exit status 1: nothing can be proven, not even under the paper's conditions; or --require is not met.
 
-    Exit status 1: nothing can be certified, not even under the paper's conditions; or --require
-    is not met.
-
-    Each bound says whether it is proved, by noack-check, or computed and not checked. Proofs are searched
-    for some seconds, at most some minutes, and kept in the cache folder of the user.
-
-    With --no-proofs takes two seconds; some 10 s for a nonlinear plant, or where events are due after
-    many tests.
+    Each bound was verified by noack-check. What is found is kept in the cache folder of the user.
     """
-    from cosim.analysis.certificates import certificates_of, in_chosen_norm
+    from cosim.analysis.certificates import certificates_of
     from cosim.analysis.witnesses import require_covered
     from cosim.live.monitoring.progress import work_bar
     from cosim.output.certificate_report import certificate_document
@@ -111,46 +95,33 @@ def certify(
     from cosim.record.run_directory import write_output
     from noack.core.file_access import require_suffix
     from noack.scenario.resolution import resolve
+    from noack.theory.witnesses.effort import MOST_WORK
 
     if out is not None:
         require_suffix(out, "--out", ".mat")
-    if witness is not None and not proofs:
-        raise CallerError("--witness: there is none with --no-proofs")
-    loaded, chosen = opt.load_loop(scenario, settings, loop, network), None
+    loaded = opt.load_loop(scenario, settings, loop, network)
     if witness is not None:
         resolved = resolve(loaded)
         require_covered(resolved, resolved.certificate.late_periods if late is None else late)
     with uncovered_as_unmet(require or ()):
-        if weight == NormName.CHOSEN:
-            with work_bar("choosing the weight") as bar:
-                result = certificates_of(loaded, weight, late, bar, of_model=True)
-        else:
-            result = certificates_of(loaded, weight, late, of_model=True)
-    witnesses = None
-    if proofs:
-        with work_bar("searching for proofs", lines=True) as bar:
-            witnesses = result.prove(bar)
-        if witness is not None and witnesses.are_any:
-            write_output(witness, witnesses.file_text())
+        result = certificates_of(loaded, late)
+    with work_bar("searching for proofs", lines=True) as bar:
+        witnesses = result.prove(bar, MOST_WORK if search else 0.0)
+    if witness is not None and witnesses.are_any:
+        write_output(witness, witnesses.file_text())
+    if search:
         with work_bar("trying smaller thresholds", lines=True) as bar:
             result.advise(bar)
-    if weight == NormName.GIVEN and not result.schedule.exists:
-        with work_bar("no certificate in the given norm; choosing another") as bar:
-            chosen = in_chosen_norm(loaded, result, bar)
-        if chosen is not None and proofs:
-            with work_bar("searching for proofs in the other norm", lines=True) as bar:
-                chosen.prove(bar)
-    document = certificate_document(result, chosen, verbose=verbose or tables is not None)
+    document = certificate_document(result, verbose=verbose or tables is not None)
     show(document, json=json, tables=tables)
     if out is not None:
         save_mat(result.to_json(), out)
-    certified = any(certificate.exists for _, certificate in result)
-    if witness is not None and witnesses is not None and not witnesses.are_any:
+    if witness is not None and not witnesses.are_any:
         status("no witness was found; no file is written")
         return ExitStatus.FAILED
     if require:
         return status_of(unmet_by_scenario(result, require))
-    return ExitStatus.OK if certified else ExitStatus.FAILED
+    return ExitStatus.OK if any(certificate.exists for _, certificate in result) else ExitStatus.FAILED
 
 
 class AdversaryAim(StrEnum):
@@ -213,7 +184,6 @@ def adversary(
     from cosim.cli.execute_run import warn_of_left_out
     from cosim.live.monitoring.progress import search_activity
     from noack.scenario.resolution import resolve
-    from noack.theory.certificates.scenario_certificates import certify as certify_scenario
 
     try:
         within = [] if horizon is None else [f"horizon_s={horizon}"]
@@ -227,12 +197,9 @@ def adversary(
     if continuous:
         warn_of_left_out(resolved)
     by_runs = not continuous and not resolved.coverage.is_linear
-    if by_runs:
-        certificate = _region_certificate(resolved)
-    else:
-        certificate = certify_scenario(
-            resolved, adversary_search.conditions_of(resolved, continuous=continuous)
-        )
+    certificate = _certificate_to_compare(resolved, ideal=continuous)
+    if by_runs and not certificate.exists:
+        raise CallerError(f"no certificate: {certificate.void}")
     kinds, is_all = adversary_search.Objective, objective is AdversaryAim.ALL
     aims = list(kinds) if is_all else [kinds(objective.value)]
     worst_cases: list[WorstRun] = []
@@ -271,20 +238,15 @@ def adversary(
     return ExitStatus.FAILED if is_exceeded else ExitStatus.OK
 
 
-def _region_certificate(resolved: "Scenario") -> "ScenarioCertificate":
-    """Return the certificate of a plant that is not given by matrices, as ``noack certify`` proves it.
-
-    Raises:
-        CallerError: it has none.
-    """
-    from cosim.analysis.certificates import certificates_of
+def _certificate_to_compare(resolved: "Scenario", *, ideal: bool) -> "ScenarioCertificate":
+    """Return the certificate of the scenario's own plant, as ``noack certify`` proves it."""
+    from cosim.analysis.certificates import Certificates
     from cosim.live.monitoring.progress import work_bar
 
-    results = certificates_of(resolved, of_model=True)
+    results = Certificates(resolved, resolved.certificate.late_periods)
     with work_bar("searching for proofs", lines=True) as bar:
-        results.prove(bar, conditions=("schedule",))
-    if (certificate := results.of_own_plant) is None or not certificate.exists:
-        raise CallerError(results.answer.text)
+        results.prove(bar, conditions=("ideal",) if ideal else ("schedule",))
+    (_, certificate), *_ = results
     return certificate
 
 

@@ -7,8 +7,7 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 ``state/<name>``          x, x_s, x_c of one coordinate (3 scalars)
 ``error/norm``            bound of ‖e_c‖ from (I1), ‖e_s‖, threshold, ‖e_c‖ (4 scalars)
 ``error/log10``           decimal logarithms of these and of the certified bound (5 scalars)
-``size/log10``            decimal logarithms of ‖x‖ (last of 3 scalars) and of its certified bounds:
-                          from x(0), and from the newest event
+``size/log10``            decimal logarithms of the certified bound of ‖x‖, and of ‖x‖ (2 scalars)
 ``output/<name>``         decimal logarithms of an output that the scenario states: its certified bound,
                           its allowed error, its distance from what it follows (3 scalars)
 ``input``                 u = K x_c (m scalars)
@@ -191,9 +190,9 @@ def _styles(layout: LoopLayout) -> dict[str, Static]:
         ERROR: rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4]),
         ERROR_LOG10: rr.SeriesLines(names=errors, colors=colours, widths=widths),
         SIZE_LOG10: rr.SeriesLines(
-            names=["certified from x(0)", "bound, given x at the last event", "‖x‖ plant"],
-            colors=[CERTIFIED, CERTIFIED, PLANT],
-            widths=[2.0, 1.0, 2.5],
+            names=["certified", "‖x‖ plant"],
+            colors=[CERTIFIED, PLANT],
+            widths=[2.0, 2.5],
         ),
         EVENT_CERTIFIED: rr.SeriesLines(names="certified minimum", colors=CERTIFIED, widths=1.5),
         INPUT: rr.SeriesLines(

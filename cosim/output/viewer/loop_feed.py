@@ -13,7 +13,6 @@ from cosim.output.viewer.pictures.picture import Frames
 from cosim.record.align import (
     AlignedRun,
     ControllerTrack,
-    EventFollower,
     Reals,
     Times,
     align_measurements,
@@ -26,7 +25,6 @@ from cosim.record.decimation import decimate_all
 from cosim.record.rows import Rows, concatenate_rows, messages_in
 from cosim.record.run_events import claimed_until_s, model_flow
 from noack.core.clock import NS_PER_S
-from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_SETTING,
@@ -41,14 +39,8 @@ from noack.protocol.record_tables import (
 from noack.runtime.host_clocks import CLOCK_NOTICE
 from noack.scenario.resolution import loop_of, policy_of, tables_of
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.certified_bounds import (
-    KnownStateBounds,
-    ScenarioCertificate,
-    known_state_bounds,
-)
-from noack.theory.certificates.conditions import allowed_conditions
-from noack.theory.certificates.scenario_certificates import certify
-from noack.theory.coverage import refusals
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.coverage import is_papers_loop
 from noack.theory.paper import ErrorMonitor
 
 LAG_S = 0.2
@@ -92,7 +84,7 @@ class LoopFeed:
         certified: bool = True,
     ) -> None:
         self._columns = columns
-        self._is_certified = certified and not refusals(scenario)
+        self._is_certified = certified and is_papers_loop(scenario)
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view
@@ -105,7 +97,6 @@ class LoopFeed:
         self._forced: set[int] = set()
         shortest_ns = scenario.timing.measurement_period.lengths_ns[0]
         self._monitor = ErrorMonitor(self._loop.H, policy_of(scenario), shortest_ns)
-        self._follower = EventFollower(scenario)
         # Plant steps whose x or z is shown with the measurements at their times.
         self._steps = np.zeros(0, self._types[PLANT_STEP])
         self._has_internal_state = "z" in (self._steps.dtype.names or ())
@@ -189,9 +180,7 @@ class LoopFeed:
         curves = [aligned.x, aligned.x_s, aligned.x_c, aligned.e_s_norm, aligned.e_c_norm, bounds]
         kept = self._rows_to_show(aligned.t_ns, np.column_stack(curves))
         thin = AlignedRun._make(values[kept] for values in aligned)
-        of_state = np.column_stack(
-            [self._certified_bound(t_s, "state"), self._bound_from_event(rows, aligned)]
-        )
+        of_state = self._certified_bound(t_s, "state")
         of_outputs = np.array([self._certified_bound(t_s, "state", i) for i in range(len(self._outputs))])
         self._view.add_samples(thin, bounds[kept], of_state[kept], of_outputs.reshape(-1, len(t_s)).T[kept])
         frames = Frames(t_s, aligned.x, aligned.x_s, aligned.x_c, z)
@@ -214,8 +203,7 @@ class LoopFeed:
         """The run's certificate; None if there is none. Computed at first use, since it is slow."""
         if not self._is_certified or self._loop.reference is not None or self._loop.loads:
             return None  # with a reference or loads, it bounds the deviations from it
-        computed = certify(self._scenario, allowed_conditions(self._scenario))
-        (certificate,) = run_certificates.with_proofs([computed], self._scenario, 0.0)  # as far as known
+        certificate = run_certificates.scheduled_certificates(self._scenario)[0]  # without a search
         if certificate.inter_event_s is not None:
             self._view.add_certified_interval(certificate.inter_event_s, self._scenario.timing.horizon_ns)
         return certificate
@@ -230,21 +218,6 @@ class LoopFeed:
         if output is not None:
             certificate = certificate.of_output(output, self._outputs[output].row)
         bound = getattr(certificate, quantity)(t_s)
-        return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
-
-    @cached_property
-    def _known_state(self) -> KnownStateBounds | None:
-        if self._certificate is None or self._certificate.constants is None:
-            return None
-        return known_state_bounds(self._scenario, self._certificate)
-
-    def _bound_from_event(self, rows: Rows, aligned: AlignedRun) -> Reals:
-        """Return the certified bound of ‖x‖ from the newest event on, (k,); NaN for none."""
-        if (known := self._known_state) is None:
-            return np.full(len(rows), np.nan)
-        t_s, since = np.asarray(rows["t_ns"] * 1e-9), self._follower.take(rows, aligned)
-        moved = known.state_deviation(t_s, since.age_s, since.missing)
-        bound = np.fmin(row_norms(since.predicted) + moved, self._certified_bound(t_s, "state"))
         return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
 
     def _identity_bound(self, rows: Rows, aligned: AlignedRun) -> Reals:

@@ -209,8 +209,7 @@ class LoopView:
         Args:
             aligned: states, errors and threshold on a common time grid.
             e_c_bounds: (k, 2) bounds of ‖e_c‖, from (I1) and certified; NaN for none.
-            x_bounds: (k, 2) bounds of ‖x‖, certified from x(0) and from the newest event; NaN for
-                none.
+            x_bounds: (k,) certified bounds of ‖x‖; NaN for none.
             y_bounds: (k, p) certified bounds of the layout's outputs; NaN for none. None: of all.
         """
         t_ns = aligned.t_ns

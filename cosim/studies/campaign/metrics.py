@@ -23,8 +23,7 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import Output, error_gains
+from noack.theory.response_bounds import NotDecayingError, bound_response
 
 Metric = Literal[
     "transmissions",
@@ -111,8 +110,8 @@ def compute_metrics(
 def certified_error(resolved: Scenario) -> float | None:
     """Return Δβ with ‖e_c‖_W ≤ Δβe^{−αt} for every plant and every x(0); None if there is none.
 
-    By identity (I1), Δ is the sum of the gains of the present error and of the longest burst of
-    lost ones, for any inter-event times. It depends on the models only. It exists if the models
+    By identity (I1), Δ = 1 + N sup‖W e^{(H+αI)τ} W⁻¹‖ with the longest burst N of lost updates, for any
+    inter-event times. It depends on the models only. It exists if the models
     decay faster than the threshold (a zero-order hold does not), the threshold has no floor, and
     the network enforces the guarantee.
     """
@@ -122,12 +121,14 @@ def certified_error(resolved: Scenario) -> float | None:
     trigger = resolved.decaying
     if trigger.floor > 0:
         return None
-    models = error_gains(loop_of(resolved), trigger.alpha_per_s)
+    loop = loop_of(resolved)
+    weight = np.eye(loop.n) if loop.weight is None else loop.weight
+    growing = loop.H + trigger.alpha_per_s * np.eye(loop.n)
     try:
-        missing_gain = float(models.missing(Output.WEIGHTED, network.longest_burst, 0.0))
+        gain = bound_response(growing, weight, np.linalg.inv(weight)).largest
     except NotDecayingError:
         return None
-    return (models.now(Output.WEIGHTED) + missing_gain) * trigger.beta
+    return (1.0 + network.longest_burst * gain) * trigger.beta
 
 
 CONFIDENCE = 0.95

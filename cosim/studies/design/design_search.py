@@ -13,6 +13,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from cosim.analysis.scenario_certificates import quick_certificate
+from cosim.analysis.witnesses import plants_of
 from cosim.simulation.exact_simulation import Population, run_batch, setting_of
 from cosim.studies.campaign.campaign_figures import undominated
 from cosim.studies.campaign.metrics import estimate, interval_ranks, quantile_interval
@@ -23,8 +25,7 @@ from noack.core.number_format import at_most, plus_minus
 from noack.core.progress import Progress, no_progress
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
-from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box
+from noack.theory.certificates.conditions import outside_box
 from noack.theory.coverage import require_exact
 
 BoundedQuantity = Literal["state", "error"]
@@ -153,12 +154,15 @@ def certified_bounds(scenario: Scenario, limits: DesignLimits) -> Bounds:
     ‖e_c‖ ≤ ‖W⁻¹‖ ‖e_c‖_W.
     """
     resolved = resolve(scenario)
-    late_periods = resolved.certificate.late_periods
-    conditions = nominal_conditions(resolved, late_periods) if limits.schedule else ideal_conditions(resolved)
-    certificate = certify_box(resolved, conditions) or certify(resolved, conditions)
-    if certificate.constants is None:
+    certificate = quick_certificate(
+        resolved,
+        plants_of(resolved)[-1],
+        ideal=not limits.schedule,
+        late_periods=resolved.certificate.late_periods,
+    )
+    if not (certificate.has("x") and certificate.has("e_c")):
         return {"state": math.inf, "error": math.inf}
-    t_s = np.array([0.0, certificate.floor_from_s if math.isfinite(certificate.floor_from_s) else 0.0])
+    t_s = np.zeros(1)
     weight = loop_of(resolved).weight
     shrinks = 1.0 if weight is None else float(np.linalg.norm(np.linalg.inv(weight), 2))
     return {

@@ -5,9 +5,9 @@ The gains and norms among which a design chooses are at the end.
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,13 +17,10 @@ from cosim.studies.regulator import lqr_gain
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.core.number_format import to_digits
-from noack.core.progress import Progress, no_progress, part_of
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows
-from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.certificates.trigger_weight import choose_weight
+from noack.theory.response_bounds import lyapunov_decay
 
 RATE_STEP, RATE_STEPS, MOST_RATE = 1.5, 6, 0.95
 """α of the grid: MOST_RATE of the decay rate, divided by powers of RATE_STEP; RATE_STEPS values."""
@@ -139,23 +136,21 @@ def space_of(families: Mapping[tuple[str, str], Scenario]) -> DesignSpace:
     return DesignSpace(normed, rates, initial_norm, floor)
 
 
-NORMS = ("identity", "given", "chosen")
+NORMS = ("identity", "given", "contracting")
+"""Of the trigger: Euclidean, the scenario's, and one that falls along the models."""
 COSTS_OF_INPUT = (0.1, 1.0, 10.0)
 """Factors of R: three regulators, from large to small inputs."""
-_LEVEL = 0.1
-"""β for which a norm is chosen, as a share of ‖x(0)‖."""
 
 
 def families_of(
     scenario: Scenario,
     norms: Sequence[str],
     lqr: tuple[Matrix, Matrix] | None,
-    progress: Progress = no_progress,
 ) -> dict[tuple[str, str], Scenario]:
     """Return scenarios by the names of gain and norm.
 
     With ``lqr`` (Q and R) the gains are those of regulators, one for each of
-    :data:`COSTS_OF_INPUT`; otherwise the gain is the scenario's. Computing a norm takes long.
+    :data:`COSTS_OF_INPUT`; otherwise the gain is the scenario's.
 
     Raises:
         CallerError: a norm or a gain cannot be computed.
@@ -164,9 +159,9 @@ def families_of(
         raise CallerError(f"--weights: name at least one of {', '.join(NORMS)}")
     gains = {"given": scenario} if lqr is None else dict(_with_regulators(scenario, *lqr))
     scenarios = {}
-    for i, (gain, regulated) in enumerate(gains.items()):
+    for gain, regulated in gains.items():
         for norm in norms:
-            scenarios[gain, norm] = _with_norm(regulated, norm, part_of(progress, i, len(gains)))
+            scenarios[gain, norm] = _with_norm(regulated, norm)
     return scenarios
 
 
@@ -212,7 +207,7 @@ def weighed_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
     )
 
 
-def _with_norm(scenario: Scenario, norm: str, progress: Callable[[float], None]) -> Scenario:
+def _with_norm(scenario: Scenario, norm: str) -> Scenario:
     """Return the scenario with a norm of its trigger, one of :data:`NORMS`."""
 
     def with_norm(rows: tuple[tuple[float, ...], ...] | None) -> Scenario:
@@ -225,18 +220,12 @@ def _with_norm(scenario: Scenario, norm: str, progress: Callable[[float], None])
         if scenario.decaying.weight is None:
             raise CallerError("--weights given: the scenario has no trigger.weight")
         return scenario
-    if norm != "chosen":
+    if norm != "contracting":
         raise CallerError(f'--weights: {", ".join(NORMS)}, not "{norm}"')
     if scenario.mode == "zoh":
-        raise CallerError("--weights chosen: models that hold do not decay; take --weights identity")
-    loop = loop_of(resolve(scenario))
-    nominal = replace(loop, A=loop.A_model, B=loop.B_model)
+        raise CallerError("--weights contracting: models that hold do not decay; take --weights identity")
     # α in the middle of the grid: a norm that contracts at this rate does so at all lower rates.
-    alpha_per_s = MOST_RATE * decay_rate(scenario) / RATE_STEP
-    beta = _LEVEL * float(np.linalg.norm(loop.x0))
-    try:
-        conditions = NetworkConditions(scenario.network.longest_burst)
-        weight = choose_weight(nominal, beta, alpha_per_s, conditions, progress)
-    except NotDecayingError as error:
-        raise CallerError(f"--weights chosen: {error}") from None
+    form, _ = lyapunov_decay(loop_of(resolve(scenario)).H, MOST_RATE * decay_rate(scenario) / RATE_STEP)
+    weight = np.linalg.cholesky(form).T
+    weight /= np.linalg.det(weight) ** (1 / len(weight))  # ‖W e‖ ≤ β has the volume of ‖e‖ ≤ β
     return with_norm(tuple(map(tuple, weight.tolist())))

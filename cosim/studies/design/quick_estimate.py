@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm, solve_discrete_lyapunov
 
-from noack.core.linear_systems import Matrix, Vector
-from noack.theory.bounds.stacked_norms import Stack
+from noack.core.linear_systems import Matrix, Stack, Vector
 from noack.theory.time_triggered.graph import Graph, spectral_radii
 from noack.theory.time_triggered.time_triggered_loop import LoopTimes, Timeline
 from noack_check.growth import Burst

@@ -21,8 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.analysis.certificates import Certificates, certificates_of, with_linear_plant, with_weight
+from cosim.analysis.certificates import Certificates, certificates_of
 from cosim.analysis.claims.run_certificates import RUN_WORK
+from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.output.guarantee_sentence import guarantee_sentence
 from cosim.output.run_verdict import SETTLED_SHARE
 from cosim.record.run_directory import refuse_among_results
@@ -48,17 +49,15 @@ from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix, Vector, discretise, norm
 from noack.core.number_checks import real_number
-from noack.core.number_format import at_most, to_digits
+from noack.core.number_format import to_digits
 from noack.plants.linear import LinearSettings
 from noack.scenario.given_settings import given_settings
 from noack.scenario.resolution import resolve, resolve_run
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, network_of, put, toml_text, with_file_names
 from noack.settings.section import ReadTable, Table
-from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
-from noack.theory.certificates.conditions import nominal_conditions
-from noack.theory.certificates.scenario_certificates import own_plant_scope
-from noack.theory.coverage import require_certifiable
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.coverage import require_linear
 from noack.theory.witnesses.effort import MOST_WORK
 from noack.trigger_policies.decaying import DecayingSettings
 
@@ -231,7 +230,7 @@ def new(
         returns = trials.returns(best)
     best, results = trials.with_threshold(best, report)
     guarantee, of_plant = _guarantee(results), results.guaranteed is not None
-    certificate, _ = trials.certify(best)
+    certificate = trials.certify(best)
     notes = tuple(_notes(best, certificate, returns, of_plant=of_plant))
     text = _file_text(trials.content(best), (f"{guarantee}.", *notes), best, fixed)
     found_certificate = certificate if certificate.exists else None
@@ -471,7 +470,7 @@ class _TrialScenarios:
                 report(f"searching for proofs: threshold {number + 1}")
                 results = self._proven(trial)
             used = results.scenario.trigger
-            if not self._is_proven(results) or is_fixed or not isinstance(used, DecayingSettings):
+            if results.guaranteed is None or is_fixed or not isinstance(used, DecayingSettings):
                 break
             largest = self.largest_share(results)
             is_enough = largest <= 1.0 and (largest >= _LEAST_USE or trial.has_friction)
@@ -487,12 +486,12 @@ class _TrialScenarios:
         """Return the trial with a decay of the threshold for which bounds are proven, else the first."""
         report("searching for proofs")
         first = trial, self._proven(trial)
-        if self._is_proven(first[1]) or not self._allowed or "trigger" in self._fixed_settings:
+        if first[1].guaranteed is not None or not self._allowed or "trigger" in self._fixed_settings:
             return first
         others = list(self._easier(trial))
         for number, other in enumerate(others, 2):
             report(f"searching for proofs: attempt {number} of {len(others) + 1}")
-            if self._is_proven(results := self._proven(other)):
+            if (results := self._proven(other)).guaranteed is not None:
                 return other, results
         return first
 
@@ -508,17 +507,9 @@ class _TrialScenarios:
         if self._fixed_settings.keys().isdisjoint(("network", "network.mansd")):
             yield replace(trial, mansd=trial.mansd // 2)
 
-    @staticmethod
-    def _is_proven(results: Certificates) -> bool:
-        """Return whether each output with an allowed error has a bound that is proven."""
-        if results.guaranteed is None:
-            return False
-        bounds = results.output_bounds(results.guaranteed)
-        return all(bound.is_proven for bound in bounds if bound.output.allowed)
-
     def _proven(self, trial: _Trial) -> Certificates:
         """Return the certificates of a trial, with the bounds that are proven."""
-        results = certificates_of(self.scenario(trial), of_model=True)
+        results = certificates_of(self.scenario(trial))
         most_work = 2 * RUN_WORK if self.is_linear else MOST_WORK
         found = results.prove(most_work=most_work, conditions=("schedule",), near=self._near)
         self._near = [each.document for each in found.statements if each.document is not None] or self._near
@@ -557,51 +548,33 @@ class _TrialScenarios:
         """Return the loaded scenario."""
         return completed(self.content(trial), self._path)
 
-    def certify(self, trial: _Trial) -> tuple[ScenarioCertificate, float]:
-        """Return the certificate of a trial's linear plant, perhaps void, and its loop gain."""
-        resolved = with_linear_plant(resolve(self.scenario(trial)))
+    def certify(self, trial: _Trial) -> ScenarioCertificate:
+        """Return the certificate of a trial's linear plant that needs no search, perhaps void."""
+        resolved = resolve(self.scenario(trial))
+        linear = resolved.plant.model_copy(update={"system": LinearSettings()})
+        resolved = resolved.model_copy(update={"plant": linear})
         resolved.coverage.require_unchanging()
-        require_certifiable(resolved, "linear")
-        conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
-        certificate = own_plant_scope(resolved).certificate(conditions)
-        if certificate.constants is not None:
-            return certificate, certificate.constants.loop_gain
-        return certificate, own_plant_scope(resolved).loop_gain(conditions)
+        require_linear(resolved)
+        return quick_certificate(resolved, late_periods=resolved.certificate.late_periods)
 
     def search(self, trials: Sequence[_Trial], report: Callable[[str], None]) -> _Trial:
         """Return the trial that is used."""
         candidates: list[tuple[float, _Trial]] = []
         if trials[0].has_friction and self._allowed:
             return trials[0]  # only a proof about the plant itself counts
-        closest, contents = (math.inf, trials[0]), set[str]()
+        contents = set[str]()
         for number, trial in enumerate(trials):
             report(f"certifying: {number + 1} of {len(trials)}")
             if (content := str(self.content(trial))) in contents:  # the given settings exclude it
                 continue
             contents.add(content)
-            certificate, loop_gain = self.certify(trial)
-            if certificate.constants is None:
-                closest = min(closest, (loop_gain, trial), key=lambda entry: entry[0])
+            bound = self.certify(trial).first("x")
+            if bound is None:
                 continue
-            candidates.append((certificate.constants.state / (norm(trial.x0) or 1.0), trial))
+            candidates.append((bound / (norm(trial.x0) or 1.0), trial))
             if candidates[-1][0] <= _LOOSE_BOUND_RATIO:
                 return trial
-        if candidates:
-            return min(candidates, key=lambda entry: entry[0])[1]
-        report("choosing a norm")
-        is_possible = math.isfinite(closest[0]) and not closest[1].gain.integrals  # W is of the states alone
-        with_norm = self._weighted(closest[1]) if is_possible else None
-        return trials[0] if with_norm is None else with_norm
-
-    def _weighted(self, trial: _Trial) -> _Trial | None:
-        """Return a trial in a norm that certifies it; None if there is none."""
-        resolved = with_linear_plant(resolve(self.scenario(trial)))
-        try:
-            _, weight = with_weight(resolved, "chosen", resolved.certificate.late_periods)
-        except CallerError:
-            return None
-        weighted = replace(trial, weight=weight)
-        return weighted if self.certify(weighted)[0].exists else None
+        return min(candidates, key=lambda entry: entry[0])[1] if candidates else trials[0]
 
     def returns(self, trial: _Trial) -> bool:
         """Whether the loop settles in virtual time, as the verdict of a run has it.
@@ -625,13 +598,13 @@ def _notes(
     plant = "the plant" if of_plant else "the linear plant ẋ = Âx + B̂u"
     if of_plant:
         pass
-    elif certificate.constants is None:
+    elif not certificate.has("x"):
         yield (
             f"No certificate was found for {plant}: {certificate.void}. Rates, gains and M were "
             "tried; noack certify tries other settings, and names those with a certificate."
         )
     else:
-        bound = envelope_formula("‖x‖", certificate, "state").format(at_most(certificate.constants.state))
+        bound = certificate.formula("‖x‖", "x")
         losses = certificate.conditions.guarantee.meaning
         yield f"Certified for {plant}, for every pattern of losses with {losses}: {bound}."
     if not of_plant:
@@ -640,8 +613,7 @@ def _notes(
         )
         yield (
             "This is not about the plant itself. If its equations are known, noack certify searches a "
-            "certificate of them: on a region that the plant does not leave, or from any x(0) if the "
-            "equations are linear; without one, a run checks only what "
+            "certificate of them; without one, a run checks only what "
             "holds for every plant; with --set 'plant.system={kind=\"linear\"}' a run has the "
             "linear plant, and is checked against its certificate. Largest relative error of the "
             f"linear model, sampled: {errors}."

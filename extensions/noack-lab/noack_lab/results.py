@@ -125,13 +125,12 @@ def exact_run_of(scenario: noack.Scenario) -> ShownRun:
 def guarantee_of(scenario: noack.Scenario) -> Guarantee:
     """Return what is certified; that nothing is, is no error."""
     try:
-        certificates = noack.certify(scenario, proofs=False)  # a search takes seconds
+        certificates = noack.certify(scenario, search=False)  # a search takes seconds
     except noack.NoackError as error:
-        reason = str(error).removesuffix("; no certificate covers this")
-        return Guarantee(VerdictText(f"no certificate: {reason}", "doubt"), [], [])
-    certificate, answer = certificates.of_own_plant, certificates.answer
-    constants = None if certificate is None else certificate.constants
-    if certificate is None or constants is None:
+        return Guarantee(VerdictText(f"no certificate: {error}", "doubt"), [], [])
+    certificate, answer = certificates.schedule, certificates.answer
+    proven = certificate.proven
+    if proven is None:
         return Guarantee(VerdictText(answer.text, "doubt"), [], [])
     t_s = np.linspace(0.0, scenario.horizon_s, _POINTS)
     style = noack.CurveStyle(_GREEN, 1.6, _DASHED)
@@ -139,8 +138,8 @@ def guarantee_of(scenario: noack.Scenario) -> Guarantee:
         bounds = [(ERRORS, certificate.controller_error(t_s)), (NORM, certificate.state(t_s))]
     facts = [
         Fact("minimum inter-event time", f"{_number(1e3 * (certificate.inter_event_s or 0.0))} ms"),
-        Fact("decay rate of the bounds", f"{_number(constants.rate_per_s)} /s"),
-        Fact("Δ of ‖e_c‖ ≤ Δ · threshold", _number(constants.delta)),
+        Fact("bound of ‖e_c‖", certificate.formula("‖e_c‖", "e_c")),
+        Fact("bound of ‖x‖", certificate.formula("‖x‖", "x")),
     ]
     facts += [
         Fact(assumption.what, f"{assumption.verdict} ({assumption.why})")
@@ -148,14 +147,12 @@ def guarantee_of(scenario: noack.Scenario) -> Guarantee:
         if assumption.verdict != "holds"
     ]
     words = "all errors stay bounded"
-    if constants.rate_per_s > 0:
-        words = f"all errors decay at {_number(constants.rate_per_s)} /s"
-        if certificate.persistent_constants is not None or np.isfinite(certificate.floor_from_s):
+    if proven.rate_per_s > 0:
+        words = f"all errors decay at {_number(proven.rate_per_s)} /s"
+        if any(bound.constant for bound in proven.bounds.values()):
             words += ", to a bound that does not decay"  # a floor, disturbances, noise
     line = VerdictText(f"{answer.text}: {words}, for every loss pattern that the guarantee allows", "good")
-    curves = [
-        noack.Curve(panel, "certified bound (computed)", "", t_s, values, style) for panel, values in bounds
-    ]
+    curves = [noack.Curve(panel, "certified bound", "", t_s, values, style) for panel, values in bounds]
     return Guarantee(line, curves, facts)
 
 

@@ -5,7 +5,6 @@ Assumptions about the run itself (delays, the longest loss burst) are checked ag
 """
 
 import math
-from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -13,14 +12,11 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.core.number_format import apart_from, at_least
+from noack.core.number_format import at_least
 from noack.scenario.estimation import SteadyState, steady_state
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
-from noack.theory.bounds.disturbances import normal_bounds
-from noack.theory.certificates.conditions import network_delay_text
-from noack.theory.coverage import key_table
+from noack.theory.certificates.conditions import NetworkConditions, network_delay_text
 
 _NOT_COVERED = "not covered by the theorems and the certificates"
 _NOT_BY_THEOREMS = "not covered by the theorems"
@@ -36,7 +32,7 @@ class AssumptionStatus(StrEnum):
     IDEALISED = "idealised"
     """No sampled loop meets it; certificates allow for the difference."""
     NOT_NEEDED = "not needed"
-    """It does not hold, or is not checked; no computed bound depends on it."""
+    """It does not hold, or is not checked; no bound depends on it."""
     ASSUMED = "assumed"
     """It is not proven; what depends on the run is checked in each run."""
 
@@ -66,8 +62,8 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
         checked.append(_violated("the input is u = K x_c", "eq:ModCont", why))
     if resolved.protocol.acknowledges:
         assumed = "the sensor resets x_s at every event; nothing is acknowledged"
-        (row,) = key_table().rows_of("network.protocol")
-        checked.append(_violated(assumed, "Section II", f'network.protocol = "ack": {row.reason}'))
+        why = 'network.protocol = "ack": x_s is reset only when an acknowledgement returns'
+        checked.append(_violated(assumed, "Section II", why))
     if linear:
         checked.append(_unstable_and_distinct(loop.A))
     checked += [_mansd(resolved), _continuous_time(resolved)]
@@ -100,8 +96,8 @@ def _checked(assumed: str, source: str, holds: bool, why: str) -> Assumption:
 def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
     kind = (
-        f'it is of kind "{resolved.plant.system.kind}": {_NOT_BY_THEOREMS}; a certificate on '
-        "a region may cover it"
+        f'it is of kind "{resolved.plant.system.kind}": {_NOT_BY_THEOREMS}; a certificate may cover '
+        "its equations"
     )
     why = f"largest real part of an eigenvalue: {nominal:.3g} /s (Â + B̂K){_other_sign(loop)}"
     return [
@@ -206,7 +202,7 @@ def _unstable_and_distinct(A: Matrix) -> Assumption:
         "A is unstable with distinct eigenvalues",
         "Proposition 1, used by Theorem 1",
         AssumptionStatus.HOLDS if holds else AssumptionStatus.NOT_NEEDED,
-        why if holds else f"{why}; used by the paper's proof, but by no bound computed here",
+        why if holds else f"{why}; used by the paper's proof, but by no bound of noack",
     )
 
 
@@ -251,66 +247,17 @@ def _actuation_gap(resolved: Scenario) -> str:
 
 
 def certificate_assumptions(
-    resolved: Scenario,
-    conditions: NetworkConditions,
-    decay_per_s: Mapping[str, float],
-    constants: Constants | None,
-    void: ArithmeticError | None,
-    loop_gain: float,
-    trigger_bound: str,
-    probability: float | None,
+    resolved: Scenario, conditions: NetworkConditions, probability: float | None
 ) -> list[Assumption]:
     """Return the assumptions of a certificate, with verdicts.
 
-    ``decay_per_s`` has the decay rates of "the models" (infinite if they hold) and "A + BK".
-    Without a certificate, ``constants`` is None and ``void`` is the reason. ``trigger_bound`` says
-    how the trigger's rule bounds e_s; it is empty if nothing does. ``probability`` is that of a run
-    that keeps a guarantee that nothing enforces, if it is known.
+    ``probability`` is that of a run that keeps a guarantee that nothing enforces, if it is known.
     """
-    # Of the trigger, and of the decay rates.
-    alpha = policy_of(resolved).fading_per_s
-    slower = 0.0 if constants is None else constants.rate_per_s
-    why = trigger_bound or "not where it does not transmit"
-    checked = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(trigger_bound), why)]
-    for matrix, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")) if alpha else ():
-        holds = is_below_decay_rate(alpha, decay_per_s[matrix])
-        why = f"α = {alpha:g} /s, {_decays(decay_per_s[matrix])}"
-        if slower and not holds:
-            why += f"; certified instead: bounds with decay rate {at_least(slower, 3)} /s"
-        elif constants is not None and not holds:
-            why += "; certified instead: constant bounds"
-        if math.isinf(decay_per_s[matrix]):
-            holds, why = False, "a hold does not decay: the certified bounds are constant"
-        checked.append(_checked(f"α is below the decay rate of {matrix}", source, holds, why))
-    # Of the network, the schedule and the disturbances.
-    checked += _conditions(conditions, resolved, probability)
-    checked += _bounded_disturbances(resolved)
-    # Of the certificate itself.
-    if constants is None:
-        is_gain = str(void).startswith("the loop gain")
-        condition = "small-gain condition" if is_gain else "condition of the certificate"
-        checked.append(_violated(condition, "certificate", str(void)))
-    else:
-        why = f"the loop gain of the errors is {apart_from(1, loop_gain)}, below 1"
-        checked.append(_checked("small-gain condition", "certificate", True, why))
-    why = "the bounds rest on (I1), which holds for every plant"
-    assumed, source = "A is unstable with distinct eigenvalues", "Proposition 1"
-    return [*checked, Assumption(assumed, source, AssumptionStatus.NOT_NEEDED, why)]
-
-
-def _bounded_disturbances(resolved: Scenario) -> list[Assumption]:
-    """Return that disturbances and noise stay within their bounds."""
-    if resolved.coverage.is_undisturbed:
-        return []
-    assumed, source = "disturbances and noise stay within their bounds", "certificate"
-    if (normal := normal_bounds(resolved)) is None:
-        return [Assumption(assumed, source, AssumptionStatus.HOLDS, "by their settings")]
-    why = (
-        f"normal values have no bound; {normal.limit:.3g} standard deviations are assumed, and "
-        "the like for their sums; a run exceeds one of these with a probability of at most "
-        f"{resolved.certificate.exceedance_probability:g}"
-    )
-    return [Assumption(assumed, source, AssumptionStatus.ASSUMED, why)]
+    checked = _conditions(conditions, resolved, probability)
+    if not resolved.coverage.is_undisturbed:
+        assumed, source = "disturbances and noise stay within their bounds", "certificate"
+        checked.append(Assumption(assumed, source, AssumptionStatus.HOLDS, "by their settings"))
+    return checked
 
 
 def _conditions(
@@ -351,8 +298,3 @@ def _conditions(
             for assumed, why in schedule
         ),
     ]
-
-
-def is_below_decay_rate(alpha_per_s: float, decay_per_s: float) -> bool:
-    """Return whether α is below the decay rate by more than rounding."""
-    return alpha_per_s < (1 - 1e-9) * decay_per_s

@@ -1,41 +1,65 @@
 """The conditions of a scenario's run, its own and the paper's; and a reference moved to 0.
 
 At a set-point x_r the loop is described in the coordinates x − x_r, x_s − x_r and x_c − x_r. The
-models rest at x_r with u_r: Âx_r + B̂u_r = 0. The plant need not. What is left, w = A x_r + B u_r,
-is a constant disturbance of the loop in these coordinates.
+models rest at x_r with u_r: Âx_r + B̂u_r = 0.
 """
 
 import math
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Vector
+from noack.core.linear_systems import Matrix
 from noack.core.periods import exact_ns
-from noack.disturbances.disturbance_settings import DisturbanceSettings
-from noack.disturbances.step import StepDisturbance
-from noack.disturbances.uniform import UniformDisturbance
-from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
-from noack.scenario.resolution import loop_of, setpoint_of
+from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.settings.section import Table
-from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.bounds.disturbances import excluded_probability
-from noack.theory.bounds.reference_limits import ReferenceLimits
+from noack.settings.section import MatrixRows, Table
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
-REGION = "the nonlinear plant on its region"
-LINEAR_EQUATIONS = "the scenario's plant (linear equations)"
+EQUATIONS = "the scenario's plant, by its equations"
 """The plants that a certificate covers, by name."""
 _ROUNDED_NS = 2
 """More than two times of steps differ from exact ones, together."""
-_AT_REST = 1e-9
-"""The plant rests if |A x_r + B u_r| is at most this share of its larger term."""
+_ROUNDED_JUMP = 1e-9
+"""A difference between two pieces of a reference is rounding up to this share of the largest x_r or u_r."""
+
+
+class NetworkConditions(NamedTuple):
+    """The assumptions of a certificate about network and schedule, in the plant's time.
+
+    They are not a schedule, but what may happen at most under one with delays and lateness: see
+    :func:`nominal_conditions`.
+    """
+
+    dropouts: int
+    """The largest number of consecutive losses: M − 1, or less by further constraints."""
+    sampling_s: float = 0.0
+    """h, the longest time between two tests of the trigger; 0 is a continuous trigger."""
+    spacing_s: float = 0.0
+    """The shortest time between two tests; all other times between tests are multiples of it. 0: tests
+    are at any times, at least ``apart_s`` apart."""
+    delay_s: float = 0.0
+    """d, the longest time from an event until a delivered update affects the plant's input."""
+    hold_s: float = 0.0
+    """σ, the largest difference between the time and the model time of the applied input."""
+    start_s: float = 0.0
+    """Time from which the plant applies the controller's input; before, its input is 0."""
+    constraints: tuple[LossRule, ...] = ()
+    """Further rules of the guarantee."""
+    apart_s: float = 0.0
+    """The shortest time between two tests that are on no grid."""
+
+    @property
+    def guarantee(self) -> LossGuarantee:
+        """All rules that the network keeps."""
+        return LossGuarantee((LongestBurst(self.dropouts), *self.constraints))
 
 
 @cached_method
@@ -104,11 +128,6 @@ def _actuation_gap_ns(resolved: Scenario) -> int:
     """Return the longest time by which the newest actuation is held up; without a bound, the run's length."""
     gap_ns, horizon_ns = resolved.timing.actuation_gap_ns, resolved.timing.horizon_ns
     return horizon_ns if gap_ns is None else gap_ns
-
-
-def first_input_ns(resolved: Scenario) -> int:
-    """Return the time by which the plant applies the input of the controller's first tick."""
-    return _next_step_ns(resolved, resolved.timing.controller_phase_ns + _actuation_gap_ns(resolved))
 
 
 def certified_delay_s(resolved: Scenario) -> float:
@@ -187,40 +206,28 @@ def kept_probability(
 ) -> float | None:
     """Bound the probability that a run's losses keep a guarantee that nothing enforces.
 
-    Until the first loss too many, events are at least ``inter_event_s`` apart, but for runs whose
-    normal values exceed their bounds. None: there is no such bound, or the losses are no Markov
-    chain over the packets.
+    Until the first loss too many, events are at least ``inter_event_s`` apart. None: there is no such
+    bound, or the losses are no Markov chain over the packets.
     """
     if not inter_event_s:
         return None
     try:
         losses = loss_process(resolved.network.link)
-        kept = losses.keeps(guarantee, most_events(resolved, inter_event_s))
+        return losses.keeps(guarantee, most_events(resolved, inter_event_s))
     except NotPredictableError:
         return None
-    return max(kept - excluded_probability(resolved), 0.0)
 
 
-def about_reference(resolved: Scenario, late_periods: int = 0, *, hold_s: float | None = None) -> Scenario:
+def about_reference(resolved: Scenario) -> Scenario:
     """Return the loop in the coordinates around its reference or set-point, which is 0 there.
 
-    An observer's first estimate is moved, too: its error is the same.
-
-    ``hold_s``: the largest age of u_r in a held input; by default that with a lateness of
-    ``late_periods`` steps.
+    An observer's first estimate is moved, too: its error is the same. What disturbs the loop in these
+    coordinates is left out: see :mod:`noack_check.reference`.
     """
     loop = loop_of(resolved)
     if loop.reference is None:
         return resolved
-    plant = resolved.plant
-    if hold_s is None:
-        hold_s = nominal_conditions(resolved, late_periods).hold_s
-    pushes = reference_pushes(resolved, hold_s)
     x_r, observer = loop.reference.state(0), resolved.observer
-    update = {
-        "initial_state": tuple((loop.x0 - x_r).tolist()),
-        "disturbances": (*plant.disturbances, *pushes),
-    }
     if observer is not None and (
         resolved.network.initial_sync == "first_packet" or observer.initial_estimate
     ):
@@ -228,45 +235,14 @@ def about_reference(resolved: Scenario, late_periods: int = 0, *, hold_s: float 
             np.zeros(loop.n) if observer.initial_estimate is None else np.array(observer.initial_estimate)
         )
         observer = observer.model_copy(update={"initial_estimate": tuple((estimate - x_r).tolist())})
+    start = {"initial_state": tuple((loop.x0 - x_r).tolist())}
     return resolved.model_copy(
         update={
-            "plant": plant.model_copy(update=update),
+            "plant": resolved.plant.model_copy(update=start),
             "observer": observer,
             "controller": resolved.controller.model_copy(update={"setpoint": None, "reference": None}),
         }
     )
-
-
-def reference_pushes(resolved: Scenario, hold_s: float) -> list[DisturbanceSettings]:
-    """Return what disturbs a linear loop in the coordinates around its reference, until x_r first jumps.
-
-    With x̃ = x − x_r and the held u_r(t_k), the plant has
-
-        dx̃/dt = A x̃ + B (ũ + u_r(t_k) − u_r(t)) + (A − Â) x_r + (B − B̂) u_r + (Â x_r + B̂ u_r − ẋ_r).
-
-    At a set-point all of this is the constant A x_r + B u_r. ``hold_s``: largest t − t_k.
-    """
-    loop = loop_of(resolved)
-    assert loop.reference is not None
-    if loop.reference.is_constant:
-        w = constant_disturbance(resolved)
-        return [StepDisturbance(kind="step", at="state", amplitude=tuple(w.tolist()))] if w.any() else []
-    limits, plant = ReferenceLimits(loop.reference, resolved.timing.horizon_ns), resolved.plant
-    own = np.hstack([loop.A - loop.A_model, loop.B - loop.B_model])
-    state = limits.largest(own)
-    if plant.uncertainty_A is not None or plant.uncertainty_B is not None:
-        half = np.hstack([
-            np.zeros_like(loop.A) if plant.uncertainty_A is None else np.array(plant.uncertainty_A),
-            np.zeros_like(loop.B) if plant.uncertainty_B is None else np.array(plant.uncertainty_B),
-        ])  # fmt: skip
-        state = np.maximum(state, half @ limits.largest(np.eye(loop.n + loop.m)))
-    state = state + limits.residual(loop.A_model, loop.B_model)
-    held = limits.largest_change(hold_s)[loop.n :]
-    return [
-        UniformDisturbance.model_validate({"kind": "uniform", "at": at, "bound": tuple(bound.tolist())})
-        for at, bound in (("input", held), ("state", state))
-        if bound.any()
-    ]
 
 
 def jump_s(resolved: Scenario) -> float | None:
@@ -274,16 +250,36 @@ def jump_s(resolved: Scenario) -> float | None:
     reference = loop_of(resolved).reference
     if reference is None or reference.is_constant:
         return None
-    return ReferenceLimits(reference, resolved.timing.horizon_ns).jump_s
+    largest = 0.0
+    for place, begin_ns in enumerate(reference.since_ns):
+        before, after = reference.segments[place : place + 2]
+        left, right = before.at((begin_ns - before.begin_ns) * 1e-9), after.at(0.0)
+        largest = max(largest, float(np.abs([left, right]).max()))
+        step = float(np.abs(right - left)[: reference.n].max())
+        if begin_ns < resolved.timing.horizon_ns and step > _ROUNDED_JUMP * largest:
+            return begin_ns / NS_PER_S
+    return None
 
 
-def constant_disturbance(resolved: Scenario) -> Vector:
-    """Return A x_r + B u_r, (n,), at the set-point of a linear plant; 0 if that is due to rounding."""
-    loop, setpoint = loop_of(resolved), setpoint_of(resolved)
-    if setpoint is None:
-        return np.zeros(loop.n)
-    x_r, u_r = setpoint
-    drift, push = loop.A @ x_r, loop.B @ u_r
-    largest = max(float(np.abs(drift).max()), float(np.abs(loop.A).max() * np.abs(x_r).max()))
-    w = drift + push
-    return w if float(np.abs(w).max()) > _AT_REST * largest else np.zeros(loop.n)
+def outside_box(resolved: Scenario) -> str | None:
+    """Return, as text, an entry of the plant outside its uncertainty box; None if there is none."""
+    loop, plant = loop_of(resolved), resolved.plant
+    if plant.uncertainty_A is None and plant.uncertainty_B is None:
+        return None
+    for name, true, model, rows in (
+        ("A", loop.A, loop.A_model, plant.uncertainty_A),
+        ("B", loop.B, loop.B_model, plant.uncertainty_B),
+    ):
+        half = _halfwidth(rows, true)
+        slack = 1e-12 * (1.0 + np.abs(model))
+        for i, j in np.argwhere(np.abs(true - model) > half + slack):
+            distance = abs(true[i, j] - model[i, j])
+            return (
+                f"the plant lies outside: {name}[{i + 1}, {j + 1}] is {distance:.3g} from the "
+                f"model's, the half-width is {half[i, j]:.3g}"
+            )
+    return None
+
+
+def _halfwidth(rows: MatrixRows | None, matrix: Matrix) -> Matrix:
+    return np.zeros_like(matrix) if rows is None else np.array(rows)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from noack.core.number_format import at_most
 from noack.scenario.outputs import LoopOutput
-from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _DIGITS = 3
 """Of numbers in sentences; they are rounded so that the sentences stay true."""
@@ -28,11 +28,6 @@ class OutputBound(NamedTuple):
     """What the output is to follow."""
 
     @property
-    def is_proven(self) -> bool:
-        """Whether the checker has proven it; else it is computed."""
-        return self.certificate.is_proven("state")
-
-    @property
     def symbol(self) -> str:
         """What is bounded: |angle|, or |angle − r| with a set-point r other than 0."""
         return f"|{self.output.name}{' − r' if self.is_deviation else ''}|"
@@ -40,12 +35,12 @@ class OutputBound(NamedTuple):
     @property
     def formula(self) -> str:
         """The bound over time, with the unit, e.g. "|angle| ≤ 0.31 e^(−0.8t) + 0.004 rad"."""
-        return self.pattern.format(at_most(self.certificate.first("state")))
+        return self.pattern.format(at_most(self.certificate.first("x")))
 
     @property
     def pattern(self) -> str:
         """The same; ``{}`` stands for the first constant."""
-        bound = envelope_formula("", self.certificate, "state")
+        bound = self.certificate.pattern("", "x")
         return f"{escaped(self.symbol)}{bound} {escaped(self.output.unit)}".rstrip()
 
     @property
@@ -87,7 +82,6 @@ class OutputBound(NamedTuple):
             "unit": self.output.unit,
             "allowed": self.output.allowed,
             "bound": self.formula,
-            "is_proven": self.is_proven,
             "in_the_limit": self.ultimate,
             "settles_s": self.settles_s,
         }
@@ -115,7 +109,7 @@ def output_bounds(
         follows: the loop follows a reference that changes over time instead.
         rest: where it rests under its constant loads, n entries; without loads 0 or none.
     """
-    if certificate.first("state") is None:
+    if not certificate.has("x"):
         return []
     bounds = []
     for index, output in enumerate(outputs):

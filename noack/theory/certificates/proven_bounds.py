@@ -34,7 +34,7 @@ class ProvenBounds(NamedTuple):
     """Of all bounds."""
     bounds: Mapping[str, ProvenBound]
     """From the start on, by the output: "x"; "e_s" and "e_c", the errors in the trigger's norm; "y[0]", …
-    for the outputs of the loop."""
+    for the outputs of the loop; with noise or an observer "estimate", the error x̂ − x in this norm."""
     limits: Mapping[str, float]
     """In the limit t → ∞, by the output: "x", and "y[0]", "y[1]", … for the outputs of the loop."""
     inter_event_s: float | None

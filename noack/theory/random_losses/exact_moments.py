@@ -34,13 +34,12 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError
-from noack.core.linear_systems import Matrix, Vector, balancing_exponents, exponential
+from noack.core.linear_systems import Matrix, Stack, Vector, balancing_exponents, exponential
 from noack.impairments.loss_prediction import OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.stacked_norms import Stack
-from noack.theory.coverage import refusal
+from noack.theory.coverage import nonlinear_because
 from noack.theory.random_losses.mean_square_growth import (
     from_triangles,
     mean_square_growth,
@@ -380,7 +379,7 @@ def require_predictable(resolved: Scenario) -> None:
     """Raise CallerError unless the loop's second moments follow linear equations."""
     resolved.coverage.require_direct_inputs()
     resolved.coverage.require_unchanging()
-    if (why := refusal(resolved, "linear")) is not None:
+    if (why := nonlinear_because(resolved)) is not None:
         raise CallerError(f"{why}; the mean cost needs a linear plant with u = K x_c")
     if resolved.observer is not None:
         raise CallerError(f'observer.kind = "{resolved.observer.kind}": the mean cost needs none')

@@ -20,14 +20,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix, Vector, balancing_exponents
+from noack.core.linear_systems import Matrix, Stack, Vector, balancing_exponents
 from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.contraction import EPSILON
-from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.time_triggered.exact_matrices import IntervalMatrix, exactly, inverse
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.time_triggered.scenario_times import intervals, loop_times
@@ -134,7 +132,7 @@ class PeriodMaps(NamedTuple):
         stack = np.ldexp(stack, shifts)
         # The common range of all maps, and balanced coordinates of it.
         U, singular, _ = np.linalg.svd(stack.transpose(2, 0, 1, 3).reshape(size, -1))
-        rank = max(int((singular > 10 * size * EPSILON * singular[0]).sum()), 1)
+        rank = max(int((singular > 10 * size * np.finfo(float).eps * singular[0]).sum()), 1)
         range_maps = U[:, :rank].T @ stack @ U[:, :rank]
         every = range_maps.reshape(-1, rank, rank)
         nodes = np.zeros(len(every), np.int64)

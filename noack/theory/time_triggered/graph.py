@@ -11,8 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Vector
-from noack.theory.bounds.stacked_norms import Stack
+from noack.core.linear_systems import Stack, Vector
 
 Numbers = NDArray[np.int64]
 """Numbers of nodes or of edges, or durations, (k,)."""

@@ -6,9 +6,9 @@ Nothing here has to be right: :mod:`noack_check.gains` solves the inequalities a
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy.linalg import solve_continuous_lyapunov
 
 from noack.core.linear_systems import Matrix
+from noack.theory.response_bounds import NotDecayingError, lyapunov_decay
 from noack.theory.witnesses.assumptions import observer_decay
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError
@@ -79,13 +79,11 @@ def rates_by_gains(loop: Loop) -> Iterator[float]:
 
 def _lyapunov(M: Matrix, rate: float, name: str) -> dict[str, object]:
     """Return P and ν with (M + r)ᵀP + P(M + r) ⪯ −2νP."""
-    G = M + rate * np.eye(len(M))
-    decay = -0.5 * float(np.linalg.eigvals(G).real.max())
-    if decay <= 0:
-        raise NoWitnessError(f"{name} does not decay at {rate:.3g}/s")
-    P = solve_continuous_lyapunov((G + decay * np.eye(len(G))).T, -np.eye(len(G)))
-    P = (P + P.T) / 2
-    return {"form": (P / np.abs(P).max()).tolist(), "decay": decay * (1 - 1e-9)}
+    try:
+        form, decay = lyapunov_decay(M, rate)
+    except NotDecayingError as error:
+        raise NoWitnessError(f"{name}: {error}") from None
+    return {"form": form.tolist(), "decay": decay}
 
 
 def _inter_event_s(gains: Gains) -> float:

@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix, Vector, balancing_exponents
-from noack.theory.bounds.stacked_norms import Stack
+from noack.core.linear_systems import Matrix, Stack, Vector, balancing_exponents
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError

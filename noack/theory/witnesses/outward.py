@@ -34,6 +34,8 @@ def proven_bounds(proof: Proof, loop: Loop) -> ProvenBounds:
             if not proof.rate > 0:
                 last = (bound.decaying**2 + bound.constant**2).sqrt()
             limits[bound.output] = above(last)
+    if loop.observer is not None or loop.noise.ncols():
+        bounds["estimate"] = ProvenBound(*map(above, noise))
     if not loop.outputs.nrows():  # they are the states
         bounds = {f"y{name[1:]}": bound for name, bound in bounds.items() if name.startswith("x[")} | bounds
     apart_s, first_s = (

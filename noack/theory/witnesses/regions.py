@@ -13,7 +13,13 @@ import numpy as np
 from noack.core.linear_systems import Vector
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations
 from noack.theory.witnesses.coordinates import floats
-from noack.theory.witnesses.documents import RoughBounds, Witness, find_witness, rough_bounds
+from noack.theory.witnesses.documents import (
+    RoughBounds,
+    Witness,
+    find_witness,
+    rough_bounds,
+    witness_by_gains,
+)
 from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
 from noack_check.equations import read_region
 from noack_check.loop import Loop
@@ -153,6 +159,18 @@ def _witness(
         most_work=most_work,
     )
     region = region_table(widths, plant.states)
+    return found._replace(document={**found.document, "equations": equations.document, "region": region})
+
+
+def region_witness_by_gains(plant: PlantOnRegions, outputs: Sequence[str]) -> Witness:
+    """Return a witness by gains of equations that are enclosed for all x and u, without a search.
+
+    Raises:
+        NoWitnessError: they are not, or nothing is proven by gains.
+    """
+    widths = np.full_like(plant.typical, np.inf)
+    equations, loop = _on(plant, widths)
+    found, region = witness_by_gains(loop, outputs), region_table(widths, plant.states)
     return found._replace(document={**found.document, "equations": equations.document, "region": region})
 
 

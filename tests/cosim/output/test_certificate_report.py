@@ -23,7 +23,7 @@ from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of
-from noack.theory.bounds.certificate_terms import Constants
+from noack.theory.certificates.conditions import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import OWN_PLANT, most_events
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds

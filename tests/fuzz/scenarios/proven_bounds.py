@@ -13,7 +13,7 @@ from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.certificate_terms import Constants
+from noack.theory.certificates.conditions import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack_check.proof import Proof
 

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.scenario.resolution import LoopMatrices, loop_of
-from noack.theory.bounds.certificate_terms import NetworkConditions
+from noack.theory.certificates.conditions import NetworkConditions
 from noack.theory.bounds.enclosure import response
 from noack.theory.paper import (
     ErrorMonitor,

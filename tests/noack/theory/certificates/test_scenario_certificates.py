@@ -16,7 +16,7 @@ from noack.core.linear_systems import spectral_abscissa
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
-from noack.theory.bounds.certificate_terms import Constants
+from noack.theory.certificates.conditions import Constants
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions

@@ -1,0 +1,48 @@
+"""A certificate from what was proven of a scenario, or from the reason why nothing was."""
+
+from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
+from noack.scenario.scenario import Scenario
+from noack.theory.certificates.assumptions import certificate_assumptions
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import (
+    BOX,
+    EQUATIONS,
+    OWN_PLANT,
+    NetworkConditions,
+    ideal_conditions,
+    kept_probability,
+    nominal_conditions,
+)
+
+_SCOPES = {"own": OWN_PLANT, "box": BOX, "region": EQUATIONS}
+"""Names of plants, by those of statements."""
+
+
+def certificate_of(
+    resolved: Scenario, statement: WitnessedStatement, conditions: NetworkConditions
+) -> ScenarioCertificate:
+    """Return the certificate of a resolved scenario with what is proven under some conditions."""
+    probability, bounds = None, statement.bounds
+    if bounds is not None and not resolved.network.enforce_mansd:
+        probability = kept_probability(resolved, conditions.guarantee, bounds.inter_event_s)
+    assumed = tuple(certificate_assumptions(resolved, conditions, probability))
+    void = None if bounds is not None else statement.reason
+    return ScenarioCertificate(_SCOPES[statement.plants], conditions, assumed, bounds, void)
+
+
+def quick_certificate(
+    resolved: Scenario, plants: str = "own", *, ideal: bool = False, late_periods: int = 0
+) -> ScenarioCertificate:
+    """Return a certificate with what is known already, or proven by gains, in about a second.
+
+    Args:
+        resolved: the scenario.
+        plants: one of :func:`cosim.analysis.witnesses.plants_of`.
+        ideal: under the paper's conditions; else under the scenario's schedule.
+        late_periods: allowed lateness in steps of the plant.
+    """
+    under = "ideal" if ideal else "schedule"
+    content = resolved_content(resolved, late_periods)
+    statement = find_statement(resolved, content, plants, under, most_work=0.0)
+    conditions = ideal_conditions(resolved) if ideal else nominal_conditions(resolved, late_periods)
+    return certificate_of(resolved, statement, conditions)
