@@ -102,7 +102,7 @@ def sampled_runs(loop: SampledLoop) -> None:
 
 def proved_by_gains(resolved: Scenario) -> None:
     """Prove the bounds of a scenario's schedule that need no search."""
-    loop = read_loop(resolved_content(resolved, 0), box=False, ideal=False)
+    loop = read_loop(resolved_content(resolved), box=False, ideal=False)
     witness_by_gains(loop, ("x", "e_c", "e_s"))
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from cosim.analysis.tried_settings import replaced
-from cosim.analysis.witnesses import find_statement, resolved_content
+from cosim.analysis.witnesses import find_statement
 from noack.core.errors import NoackError
 from noack.core.number_format import at_most, to_digits
 from noack.scenario.resolution import resolve
@@ -28,8 +28,6 @@ class ThresholdTrials:
     """Trials of smaller thresholds of a resolved scenario with a linear plant."""
 
     scenario: Scenario
-    late_periods: int
-    """Allowed lateness in steps of the plant."""
     plants: str
     """"own" or "box"."""
 
@@ -71,8 +69,7 @@ class ThresholdTrials:
             changed = resolve(validate(content, self.scenario.name))
         except NoackError:
             return None
-        tables = resolved_content(changed, self.late_periods)
-        bounds = find_statement(changed, tables, self.plants, "schedule").bounds
+        bounds = find_statement(changed, self.plants, "schedule").bounds
         if bounds is None or name not in bounds.bounds:
             return None
         return min(bounds.bounds[name].constant, bounds.limits.get(name, math.inf))

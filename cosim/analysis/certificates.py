@@ -9,7 +9,7 @@ from cosim.analysis.allowed_errors import ThresholdTrials
 from cosim.analysis.certificate_rows import certificate_rows, covered_plants
 from cosim.analysis.scenario_certificates import certificate_of
 from cosim.analysis.tried_settings import TriedSettings, helpful_box, helpful_settings, largest_settings
-from cosim.analysis.witnesses import Unproven, Witnesses, find_witnesses
+from cosim.analysis.witnesses import Unproven, Witnesses, find_witnesses, with_lateness
 from noack.core.errors import CallerError
 from noack.core.number_checks import whole_number
 from noack.core.number_format import TextRows, as_html, as_text
@@ -18,9 +18,9 @@ from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import (
     BOX,
+    allowed_conditions,
     ideal_conditions,
     jump_s,
-    nominal_conditions,
     outside_box,
 )
 from noack.theory.certificates.output_bounds import OutputBound, output_bounds
@@ -69,7 +69,6 @@ class Certificates:
     Args:
         scenario: the resolved scenario. Its bounds of x are about its set-point or reference, or where it
             rests under its loads.
-        late_periods: allowed lateness in steps of the plant.
 
     Raises:
         CallerError: its settings change.
@@ -78,9 +77,9 @@ class Certificates:
     unproven: Sequence[Unproven] = ()
     """Plants and conditions of which nothing is proven, with the reasons."""
 
-    def __init__(self, scenario: Scenario, late_periods: int) -> None:
+    def __init__(self, scenario: Scenario) -> None:
         scenario.coverage.require_constant()
-        self.scenario, self.late_periods = scenario, late_periods
+        self.scenario = scenario
         self.threshold_advice = dict[str, str]()
         """By output: what brings it within its allowed error, see :meth:`advise`."""
         self.setpoint = scenario.controller.setpoint
@@ -91,7 +90,7 @@ class Certificates:
         """When the reference first jumps: the certificates hold until then. None: it does not."""
         self._conditions = {
             IDEAL: ideal_conditions(scenario),
-            SCHEDULE: nominal_conditions(scenario, late_periods),
+            SCHEDULE: allowed_conditions(scenario),
         }
         self._found: list[tuple[str, ScenarioCertificate]] | None = None
 
@@ -111,7 +110,7 @@ class Certificates:
             conditions: "ideal" for the paper's conditions, and "schedule" for the scenario's own.
             near: documents of similar scenarios; the search begins near them.
         """
-        found = find_witnesses(self.scenario, self.late_periods, progress, most_work, conditions, near)
+        found = find_witnesses(self.scenario, progress, most_work, conditions, near)
         self._found, self.unproven = [], found.unproven
         for statement in found.statements:
             under = _UNDER[statement.conditions]
@@ -127,7 +126,7 @@ class Certificates:
         plants = "box" if certificate.scope == BOX else "own"
         for index, bound in enumerate(self.output_bounds(certificate)):
             if not bound.is_met:
-                stated = ThresholdTrials(self.scenario, self.late_periods, plants)
+                stated = ThresholdTrials(self.scenario, plants)
                 self.threshold_advice[bound.output.name] = stated.advice(bound, index, progress)
 
     def __iter__(self) -> Iterator[tuple[str, ScenarioCertificate]]:
@@ -190,12 +189,12 @@ class Certificates:
 
         Each takes some tries without a search, of about a second.
         """
-        return [*largest_settings(self.scenario, self.late_periods)] if self.schedule.exists else []
+        return [*largest_settings(self.scenario)] if self.schedule.exists else []
 
     @cached_property
     def helpful_settings(self) -> list[TriedSettings]:
         """Settings, each of which alone gives the scenario's own plant its missing certificate."""
-        return [] if self.schedule.exists else [*helpful_settings(self.scenario, self.late_periods)]
+        return [] if self.schedule.exists else [*helpful_settings(self.scenario)]
 
     @cached_property
     def helpful_box(self) -> TriedSettings | None:
@@ -203,7 +202,7 @@ class Certificates:
         box = self.schedule_box
         if box is None or box.exists or not self.schedule.exists:
             return None
-        return helpful_box(self.scenario, self.late_periods)
+        return helpful_box(self.scenario)
 
     @cached_property
     def stability(self) -> Stability | None:
@@ -302,10 +301,9 @@ def certificates_of(scenario: Scenario, late_periods: int | None = None) -> Cert
         CallerError: a wrong lateness, or settings that change.
     """
     resolved = resolve(scenario)
-    late = resolved.certificate.late_periods
     if late_periods is not None:
-        late = whole_number("late", late_periods, 0, MOST_LATE)
-    return Certificates(resolved, late)
+        resolved = with_lateness(resolved, whole_number("late", late_periods, 0, MOST_LATE))
+    return Certificates(resolved)
 
 
 def answer_for(scenario: Scenario) -> CertificateAnswer:

@@ -38,7 +38,7 @@ def growth_proof(resolved: Scenario, found: Sequence[Stability]) -> GrowthProof:
         resolved: the scenario.
         found: what is known for 0, 1, … consecutive losses.
     """
-    content = resolved_content(resolved, resolved.certificate.late_periods)
+    content = resolved_content(resolved)
     loop, proven, documents = read_periodic_loop(content), list[str](), list[dict[str, object]]()
     stable = [growth.documents["stable"] for growth in found if growth.verdict == "stable"][-1:]
     unstable = [growth.documents["unstable"] for growth in found if growth.verdict == "destabilised"][:1]

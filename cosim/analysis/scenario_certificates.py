@@ -1,6 +1,6 @@
 """A certificate from what was proven of a scenario, or from the reason why nothing was."""
 
-from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
+from cosim.analysis.witnesses import WitnessedStatement, find_statement
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -9,9 +9,9 @@ from noack.theory.certificates.conditions import (
     EQUATIONS,
     OWN_PLANT,
     NetworkConditions,
+    allowed_conditions,
     ideal_conditions,
     kept_probability,
-    nominal_conditions,
 )
 
 _SCOPES = {"own": OWN_PLANT, "box": BOX, "region": EQUATIONS}
@@ -30,19 +30,14 @@ def certificate_of(
     return ScenarioCertificate(_SCOPES[statement.plants], conditions, assumed, bounds, void)
 
 
-def quick_certificate(
-    resolved: Scenario, plants: str = "own", *, ideal: bool = False, late_periods: int = 0
-) -> ScenarioCertificate:
+def quick_certificate(resolved: Scenario, plants: str = "own", *, ideal: bool = False) -> ScenarioCertificate:
     """Return a certificate with what is known already, or proven by gains, in about a second.
 
     Args:
         resolved: the scenario.
         plants: one of :func:`cosim.analysis.witnesses.plants_of`.
-        ideal: under the paper's conditions; else under the scenario's schedule.
-        late_periods: allowed lateness in steps of the plant.
+        ideal: under the paper's conditions; else under the scenario's schedule, with its lateness.
     """
-    under = "ideal" if ideal else "schedule"
-    content = resolved_content(resolved, late_periods)
-    statement = find_statement(resolved, content, plants, under, most_work=0.0)
-    conditions = ideal_conditions(resolved) if ideal else nominal_conditions(resolved, late_periods)
+    statement = find_statement(resolved, plants, "ideal" if ideal else "schedule", most_work=0.0)
+    conditions = ideal_conditions(resolved) if ideal else allowed_conditions(resolved)
     return certificate_of(resolved, statement, conditions)

@@ -62,12 +62,10 @@ class SettingTrials:
 
     Args:
         resolved: the scenario, with its own plant.
-        late_periods: allowed lateness in steps of the plant.
     """
 
-    def __init__(self, resolved: Scenario, late_periods: int) -> None:
-        self._scenario, self._late_periods = resolved, late_periods
-        self._content: Table = dict(resolved.content())
+    def __init__(self, resolved: Scenario) -> None:
+        self._scenario, self._content = resolved, dict(resolved.content())
         self.left = _MOST_TRIALS
         """How many may still be tried."""
 
@@ -107,7 +105,7 @@ class SettingTrials:
             return False
         self.left -= 1
         own = plants or plants_of(changed)[0]
-        return quick_certificate(changed, own, late_periods=self._late_periods).exists
+        return quick_certificate(changed, own).exists
 
     def _with(self, values: Values) -> Scenario:
         content = self._content
@@ -118,7 +116,7 @@ class SettingTrials:
         return scenario
 
 
-def helpful_settings(resolved: Scenario, late_periods: int) -> Iterator[TriedSettings]:
+def helpful_settings(resolved: Scenario) -> Iterator[TriedSettings]:
     """Yield settings, each of which alone gives a scenario's own linear plant a certificate.
 
     A higher rate may be one of both plant and controller. A plant by its equations has none without a
@@ -126,17 +124,16 @@ def helpful_settings(resolved: Scenario, late_periods: int) -> Iterator[TriedSet
 
     Args:
         resolved: the scenario, which has none.
-        late_periods: allowed lateness in steps of the plant.
     """
-    trials = SettingTrials(resolved, late_periods)
+    trials = SettingTrials(resolved)
     for candidates in _candidates(resolved) if resolved.coverage.is_linear else ():
         if (tried := trials.first(candidates)) is not None:
             yield tried
 
 
-def helpful_box(resolved: Scenario, late_periods: int) -> TriedSettings | None:
+def helpful_box(resolved: Scenario) -> TriedSettings | None:
     """Return smaller half-widths with which the uncertainty box has a certificate, None if none was found."""
-    plant, trials = resolved.plant, SettingTrials(resolved, late_periods)
+    plant, trials = resolved.plant, SettingTrials(resolved)
     halfwidths = {"plant.uncertainty_A": plant.uncertainty_A, "plant.uncertainty_B": plant.uncertainty_B}
     for share in _SHARES:
         values = {
@@ -149,16 +146,15 @@ def helpful_box(resolved: Scenario, late_periods: int) -> TriedSettings | None:
     return None
 
 
-def largest_settings(resolved: Scenario, late_periods: int) -> Iterator[TriedSettings]:
+def largest_settings(resolved: Scenario) -> Iterator[TriedSettings]:
     """Yield the largest delay of the network and period of measurements that were tried, each alone.
 
     Args:
         resolved: the scenario, which has a certificate.
-        late_periods: allowed lateness in steps of the plant.
     """
     if not resolved.coverage.is_linear:
         return
-    trials, present_s = SettingTrials(resolved, late_periods), float(certified_delay_s(resolved))
+    trials, present_s = SettingTrials(resolved), float(certified_delay_s(resolved))
     period_s = resolved.timing.measurement_period_ns / NS_PER_S
     if not resolved.network.link.queues or present_s:
         key, first_s = "certificate.network_delay_s", max(2 * present_s, period_s)

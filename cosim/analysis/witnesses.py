@@ -99,7 +99,6 @@ def plants_of(resolved: Scenario) -> list[str]:
 
 def find_witnesses(
     resolved: Scenario,
-    late_periods: int,
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
     conditions: Sequence[str] = ("ideal", "schedule"),
@@ -109,13 +108,11 @@ def find_witnesses(
 
     Args:
         resolved: the scenario.
-        late_periods: allowed lateness in steps of the plant.
         progress: called with the completed share.
         most_work: limit of each search, see :class:`noack.theory.witnesses.effort.Effort`.
         conditions: "ideal" and "schedule", or one of them.
         near: documents of similar scenarios.
     """
-    content = resolved_content(resolved, late_periods)
     wanted = [(plants, under) for under in conditions for plants in plants_of(resolved)]
     found: list[WitnessedStatement] = []
     for index, (plants, under) in enumerate(wanted):
@@ -124,9 +121,9 @@ def find_witnesses(
         if under == "schedule":
             found_near = (s for s in found if s.plants == plants or s.conditions == under)
             known = [*near, *(s.document for s in found_near if s.document and plants != "region")]
-        found.append(find_statement(resolved, content, plants, under, part, most_work, known))
+        found.append(find_statement(resolved, plants, under, part, most_work, known))
     progress(1.0)
-    return Witnesses(content, found)
+    return Witnesses(resolved_content(resolved), found)
 
 
 def _part_of(progress: Callable[[float], None], index: int, count: int, share: float) -> None:
@@ -134,9 +131,9 @@ def _part_of(progress: Callable[[float], None], index: int, count: int, share: f
     progress((index + share) / count)
 
 
-def require_covered(resolved: Scenario, late_periods: int) -> None:
+def require_covered(resolved: Scenario) -> None:
     """Raise CallerError if the checker covers a scenario neither under its schedule nor under ideal ones."""
-    content = resolved_content(resolved, late_periods)
+    content = resolved_content(resolved)
     for conditions in ("schedule", "ideal"):
         try:
             if resolved.coverage.is_linear:
@@ -151,21 +148,25 @@ def require_covered(resolved: Scenario, late_periods: int) -> None:
             return
 
 
-def resolved_content(resolved: Scenario, late_periods: int) -> dict[str, object]:
+def resolved_content(resolved: Scenario) -> dict[str, object]:
     """Return the tables of a resolved scenario, as `noack check --resolved` prints them."""
+    return dict(with_stated_times(resolved).content())
+
+
+def with_lateness(resolved: Scenario, late_periods: int) -> Scenario:
+    """Return a scenario whose certificates allow for another lateness, in steps of the plant."""
     certificate = resolved.certificate.model_copy(update={"late_periods": late_periods})
-    stated = with_stated_times(resolved.model_copy(update={"certificate": certificate}))
-    return dict(stated.content())
+    return resolved.model_copy(update={"certificate": certificate})
 
 
 def find_statement(
     resolved: Scenario,
-    content: Mapping[str, object],
     plants: str,
     conditions: str,
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
     near: Sequence[Mapping[str, object]] = (),
+    *,
     longer: Mapping[str, fmpq] | None = None,
 ) -> WitnessedStatement:
     """Search for the witness of one statement of a resolved scenario: its plants and conditions.
@@ -175,7 +176,6 @@ def find_statement(
 
     Args:
         resolved: the scenario.
-        content: its tables, as :func:`resolved_content` returns them.
         plants: one of :func:`plants_of`.
         conditions: "ideal" or "schedule".
         progress: called with the completed share.
@@ -183,7 +183,7 @@ def find_statement(
         near: documents of other statements of the scenario.
         longer: some of the loop's times are at least these, in s.
     """
-    has_outputs = conditions == "schedule"
+    content, has_outputs = resolved_content(resolved), conditions == "schedule"
     try:
         if plants == "region":
             plant = plant_on_regions(resolved, content, conditions, longer)
@@ -193,12 +193,11 @@ def find_statement(
         else:
             loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal", longer=longer)
             witness = known_or_found(loop, progress, most_work, has_outputs=has_outputs, near=near)
+        bounds = proven_bounds(witness.proof, loop)
     except (RefusedError, NoWitnessError, NotEnclosedError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
-    return WitnessedStatement(
-        plants, conditions, document, witness.proof, "", proven_bounds(witness.proof, loop)
-    )
+    return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds)
 
 
 def plant_on_regions(

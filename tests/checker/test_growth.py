@@ -39,7 +39,7 @@ def scenario(name: str, *settings: str) -> Scenario:
 
 def periodic(name: str, *settings: str) -> PeriodicLoop:
     resolved = scenario(name, *settings)
-    return read_periodic_loop(resolved_content(resolved, resolved.certificate.late_periods))
+    return read_periodic_loop(resolved_content(resolved))
 
 
 def matrices(loop: PeriodicLoop) -> tuple[list[Matrix], list[Matrix]]:
@@ -192,7 +192,7 @@ def changed_document(document: Mapping[str, object], rng: np.random.Generator) -
 def test_what_is_accepted_of_changed_witnesses_is_true(seed: int) -> None:
     rng = np.random.default_rng(seed)
     resolved = scenario(*SMALL)
-    content = resolved_content(resolved, resolved.certificate.late_periods)
+    content = resolved_content(resolved)
     loop = read_periodic_loop(content)
     document, _ = accepted(loop)
     rejected = 0
@@ -281,7 +281,7 @@ def test_an_observer_that_learns_nothing_is_not_called_stable() -> None:
     """x̂ = 0 and u = 0 at all times, while x grows."""
     plant = ("plant.draw=given", "plant.A=[[0.0, 1.0], [0.0, 0.0]]", "plant.B=[[0.0], [1.0]]")
     resolved = scenario("double_integrator", *plant, PERIODIC)
-    content = resolved_content(resolved, resolved.certificate.late_periods)
+    content = resolved_content(resolved)
     content["observer"] = {"kind": "luenberger", "gain": [[0.0, 0.0]] * 2, "initial_estimate": [0.0, 0.0]}
     with pytest.raises(RefusedError, match="observer"):
         read_periodic_loop(content)

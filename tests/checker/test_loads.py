@@ -25,12 +25,12 @@ MOTOR = "dc_motor_load"
 
 
 def motor(*settings: str) -> dict[str, Any]:
-    return dict(resolved_content(resolved(MOTOR, *settings), 2))
+    return dict(resolved_content(resolved(MOTOR, *settings)))
 
 
 @pytest.fixture(scope="module")
 def statement() -> WitnessedStatement:
-    found = find_statement(motor(), "own", "schedule")
+    found = find_statement(resolved(MOTOR), "own", "schedule")
     assert found.proof is not None, found.reason
     return found
 

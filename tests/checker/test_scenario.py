@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 from flint import arb_mat, fmpq
+from noack.theory.certificates.refusals import refusals_about_reference
 
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import about_reference, allowed_conditions, ideal_conditions
-from noack.theory.certificates.refusals import refusals_about_reference
 from noack_check.keys import RefusedError, key_table, refusals
 from noack_check.loop import Loop
 from noack_check.scenario import output_names, read_loop

@@ -2,11 +2,9 @@
 
 The four plants are written down once more, for many states at a time. A run meets the conditions of
 a certificate and no more: tests every h, updates that take up to d, inputs up to σ old, no input
-before t_a, and losses that an attacker chooses up to the longest burst. ``python -m
-tests.oracles.attacked_regions [RUNS]`` prints the table of docs/theory.md.
+before t_a, and losses that an attacker chooses up to the longest burst.
 """
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -15,18 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from noack.core.linear_systems import Vector
-from noack.plants.systems.enclosed_motion import Inclusion
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import allowed_conditions
-from noack.theory.certificates.region import RegionScope
 
 Reals = NDArray[np.float64]
 Field = Callable[[Reals, Reals], Reals]
-BATCH, STEPS = 1000, 2000
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
@@ -92,22 +85,6 @@ CASES = {
 }  # fmt: skip
 
 
-def certificate_of(resolved: Scenario, semi_axes: tuple[float, ...]) -> ScenarioCertificate:
-    """Return the certificate of all x(0) in an ellipsoid."""
-    return RegionScope(resolved, start=np.diag(semi_axes)).certificate(allowed_conditions(resolved))
-
-
-def inclusion_share(box: Inclusion, field: Field, widths: Vector, points: int = 4000) -> float:
-    """Return the largest share of a box of matrices that f uses, in points and corners of a region."""
-    rng, n = np.random.default_rng(1), len(box.A)
-    z = rng.uniform(-1, 1, (points, len(widths)))
-    z[::2] = np.sign(z[::2])
-    z = (z * rng.uniform(0, 1, (points, 1)) ** 0.2 * widths).T
-    middle, half = np.hstack([box.A, box.B]), np.hstack([box.halfwidth_A, box.halfwidth_B])
-    rounding = 1e-12 * np.abs(middle) @ np.abs(z) + 1e-300
-    return float((np.abs(field(z[:n], z[n:]) - middle @ z) / (half @ np.abs(z) + rounding)).max())
-
-
 def attacked(
     resolved: Scenario,
     case: Case,
@@ -124,9 +101,11 @@ def attacked(
     t_s = np.arange(steps) * certificate.conditions.sampling_s
     loops = _AttackedLoops(resolved, case, certificate, runs, np.random.default_rng(seed))
     worst = dict.fromkeys(("x", "u", "‖x‖", "‖e_s‖", "‖e_c‖"), 0.0)
-    region = certificate.region
-    assert region is not None
-    limit_x, limit_u = np.array(region.x)[:, None], np.array(region.u)[:, None]
+    n, proven = len(case.semi_axes), certificate.proven
+    assert proven is not None
+    entries = proven.entries(n, 1)
+    limits = np.array([sum(entries[k]) if k in entries else np.inf for k in range(n + 1)])[:, None]
+    limit_x, limit_u = limits[:n], limits[n:]
     bounds = [of(t_s) for of in (certificate.state, certificate.sensor_error, certificate.controller_error)]
 
     def share(signal: str, values: Reals, limits: Reals | float) -> None:
@@ -232,35 +211,3 @@ class _AttackedLoops:
         k3 = self.field(x + h / 2 * k2, u)
         self.x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + self.field(x + h * k3, u))
         self.x_s, self.x_c = self.model_step @ self.x_s, self.model_step @ self.x_c
-
-
-def main(runs: int) -> None:
-    """Print the table: each plant, its region, M, the bound, and what the attacks reached."""
-    print("| plant | x(0) in the ellipsoid of | M | region | ‖x‖ ≤ | runs | reached |")
-    print("|---|---|---|---|---|---|---|")
-    for name, case in CASES.items():
-        resolved = case.resolved()
-        certificate = certificate_of(resolved, case.semi_axes)
-        region, constants, loop = certificate.region, certificate.constants, loop_of(resolved)
-        assert region is not None
-        assert constants is not None
-        limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
-        worst = dict.fromkeys(("x", "‖x‖"), 0.0)
-        for seed in range(0, runs, BATCH):
-            shares = attacked(
-                resolved, case, certificate, runs=min(BATCH, runs - seed), steps=STEPS, seed=seed
-            )
-            worst = {signal: max(most, shares[signal]) for signal, most in worst.items()}
-            assert max(shares.values()) <= 1, shares
-        print(
-            f"| {name} | {', '.join(map(str, case.semi_axes))} "
-            f"| {certificate.conditions.dropouts + 1} "
-            f"| {', '.join(f'{of} {limit:.3g}' for of, limit in limits)} "
-            f"| {constants.state:.3g} e^(−{constants.rate_per_s:g} t) | {runs:,} "
-            f"| {worst['x']:.2f} of the region, {worst['‖x‖']:.2f} of the bound |",
-            flush=True,
-        )
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else BATCH)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from flint import fmpq
 
 from cosim.analysis.scenario_certificates import certificate_of
-from cosim.analysis.witnesses import find_statement, plants_of, resolved_content
+from cosim.analysis.witnesses import find_statement, plants_of
 from noack.core.clock import NS_PER_S
 from noack.scenario.loads import with_constant_load
 from noack.scenario.scenario import Scenario
@@ -62,7 +62,6 @@ def certificates_under(
     They hold until a setting on which they depend, or a load, first changes.
     """
     scenario = with_constant_load(scenario)
-    content = resolved_content(scenario, scenario.certificate.late_periods)
     if not scenario.certificate.prove:
         most_work = 0.0
     times_s = {"delay": conditions.delay_s, "age": conditions.hold_s, "start": conditions.start_s}
@@ -70,7 +69,7 @@ def certificates_under(
     return [
         certificate_of(
             scenario,
-            find_statement(scenario, content, plants, "schedule", most_work=most_work, longer=longer),
+            find_statement(scenario, plants, "schedule", most_work=most_work, longer=longer),
             conditions,
         )
         for plants in plants_of(scenario)

@@ -101,8 +101,7 @@ def certify(
         require_suffix(out, "--out", ".mat")
     loaded = opt.load_loop(scenario, settings, loop, network)
     if witness is not None:
-        resolved = resolve(loaded)
-        require_covered(resolved, resolved.certificate.late_periods if late is None else late)
+        require_covered(resolve(loaded))
     with uncovered_as_unmet(require or ()):
         result = certificates_of(loaded, late)
     with work_bar("searching for proofs", lines=True) as bar:
@@ -243,7 +242,7 @@ def _certificate_to_compare(resolved: "Scenario", *, ideal: bool) -> "ScenarioCe
     from cosim.analysis.certificates import Certificates
     from cosim.live.monitoring.progress import work_bar
 
-    results = Certificates(resolved, resolved.certificate.late_periods)
+    results = Certificates(resolved)
     with work_bar("searching for proofs", lines=True) as bar:
         results.prove(bar, conditions=("ideal",) if ideal else ("schedule",))
     (_, certificate), *_ = results

@@ -158,7 +158,6 @@ def certified_bounds(scenario: Scenario, limits: DesignLimits) -> Bounds:
         resolved,
         plants_of(resolved)[-1],
         ideal=not limits.schedule,
-        late_periods=resolved.certificate.late_periods,
     )
     if not (certificate.has("x") and certificate.has("e_c")):
         return {"state": math.inf, "error": math.inf}

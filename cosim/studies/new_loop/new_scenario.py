@@ -555,7 +555,7 @@ class _TrialScenarios:
         resolved = resolved.model_copy(update={"plant": linear})
         resolved.coverage.require_unchanging()
         require_linear(resolved)
-        return quick_certificate(resolved, late_periods=resolved.certificate.late_periods)
+        return quick_certificate(resolved)
 
     def search(self, trials: Sequence[_Trial], report: Callable[[str], None]) -> _Trial:
         """Return the trial that is used."""

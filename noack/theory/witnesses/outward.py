@@ -7,6 +7,7 @@ from fractions import Fraction
 from flint import arb
 
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
+from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.loop import Loop
 from noack_check.noise import noise_of
 from noack_check.proof import Proof
@@ -21,6 +22,9 @@ def proven_bounds(proof: Proof, loop: Loop) -> ProvenBounds:
 
     The errors of certificates and records are about the measured or estimated x + n; those of proofs are
     about x.
+
+    Raises:
+        NoWitnessError: a number is too large for a float.
     """
     noise = noise_of(loop, proof.rate).sizes
     bounds, limits = dict[str, ProvenBound](), dict[str, float]()
@@ -57,6 +61,8 @@ def below(value: arb) -> float:
 
 
 def _rounded(value: arb, rounding: str) -> tuple[float, Fraction]:
+    if not math.isfinite(float(value)):
+        raise NoWitnessError("a bound is too large for floating point")
     parts = value.mid().fmpq()
     exact = Fraction(int(parts.p), int(parts.q))
     if exact == Fraction(short := float(f"{float(value):.{_DIGITS}g}")):

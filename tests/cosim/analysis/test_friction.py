@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cosim.analysis.witnesses import find_region_statement, resolved_content
+from cosim.analysis.witnesses import find_statement
 from cosim.simulation.virtual_time import simulate
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
@@ -16,8 +16,7 @@ SERVO = SCENARIOS / "friction_servo.toml"
 @pytest.fixture(scope="module")
 def proven() -> ProvenBounds:
     resolved = resolve(load(SERVO))
-    content = resolved_content(resolved, resolved.certificate.late_periods)
-    statement = find_region_statement(resolved, content, "schedule")
+    statement = find_statement(resolved, "region", "schedule")
     assert statement.bounds is not None, statement.reason
     return statement.bounds
 

@@ -25,7 +25,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture(scope="module")
 def witness() -> Witness:
     """What is found of the loop below; the search takes a second."""
-    content = resolved_content(resolved("double_integrator"), 2)
+    content = resolved_content(resolved("double_integrator"))
     return find_witness(read_loop(content, box=False, ideal=False))
 
 
@@ -46,7 +46,7 @@ def searches(witness: Witness, monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 def found(*settings: str, most_work: float = 20.0) -> WitnessedStatement:
     scenario = resolved("double_integrator", *settings)
-    return find_statement(resolved_content(scenario, 2), "own", "schedule", most_work=most_work)
+    return find_statement(scenario, "own", "schedule", most_work=most_work)
 
 
 def test_a_witness_is_found_once_for_the_same_numbers(folder: Path, searches: list[float]) -> None:

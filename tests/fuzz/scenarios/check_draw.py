@@ -20,11 +20,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.adversary import Objective, conditions_of, find_worst
+from cosim.analysis.adversary import Objective, find_worst
 from cosim.analysis.certificates import certificates_of
 from cosim.analysis.explained_run.explain import explains
 from cosim.analysis.replay.run_replay import replay_run
-from cosim.analysis.witnesses import find_region_statement, find_statement, resolved_content
+from cosim.analysis.scenario_certificates import certificate_of, quick_certificate
+from cosim.analysis.witnesses import find_statement, plants_of
 from cosim.cli.scenario_check import check_scenario
 from cosim.live.finalize import finalize
 from cosim.record.run_directory import RunEnding
@@ -35,11 +36,11 @@ from noack.scenario.resolution import loop_of, resolve, resolve_run, resolved_lo
 from noack.scenario.scenario import Scenario, loops_by_entry
 from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.scenario_certificates import certify
+from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions
 from noack.trigger_policies.decaying import DecayingSettings
 from noack_check.proof import Proof
 from tests.fuzz.scenarios.draws import Draw, draw, drawn_keys
-from tests.fuzz.scenarios.proven_bounds import proven_limit, sizes_of, with_proven_bounds
+from tests.fuzz.scenarios.proven_bounds import proven_limit, sizes_of
 
 LIMIT_S = 60.0
 """Largest CPU time of a step."""
@@ -168,7 +169,7 @@ class Checks:
     def certify(self, loop: Scenario) -> None:
         """Certify a loop under both conditions."""
         with self.step("certify"):
-            results = certificates_of(loop, of_model=True)
+            results = certificates_of(loop)
             json.dumps([certificate.to_json() for _, certificate in results], allow_nan=False)
             self.counts["certified"] += results.answer.is_certified
 
@@ -184,7 +185,7 @@ class Checks:
     ) -> None:
         if certificate is None:
             with self.step("certificate to attack"):
-                certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
+                certificate = quick_certificate(resolved, ideal=continuous)
         for objective in (Objective.ERROR, Objective.STATE, Objective.INTER_EVENT):
             if certificate is None:
                 return
@@ -206,11 +207,8 @@ class Checks:
         for conditions in ("schedule", "ideal"):
             proof = None
             with self.step(f"prove, {conditions}"):
-                content = resolved_content(resolved, resolved.certificate.late_periods)
-                if resolved.coverage.is_linear:
-                    statement = find_statement(content, "own", conditions)
-                else:
-                    statement = find_region_statement(resolved, content, conditions)
+                plants = plants_of(resolved)[0]
+                statement = find_statement(resolved, plants, conditions)
                 proof = statement.proof
                 self.refusals[f"prove: {statement.reason}"] += proof is None
             if proof is None:
@@ -221,9 +219,8 @@ class Checks:
                 self.compare(ending, proof)
             is_attacked = isinstance(resolved.trigger, DecayingSettings) and resolved.coverage.is_undisturbed
             if resolved.coverage.is_linear and (not is_ideal or is_attacked):
-                certificate = with_proven_bounds(
-                    certify(resolved, conditions_of(resolved, continuous=is_ideal)), proof, resolved
-                )
+                assumed = ideal_conditions(resolved) if is_ideal else allowed_conditions(resolved)
+                certificate = certificate_of(resolved, statement, assumed)
                 self._attack(resolved, continuous=is_ideal, certificate=certificate)
 
     def compare(self, ending: RunEnding, proof: Proof) -> None:

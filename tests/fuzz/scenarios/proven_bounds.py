@@ -1,8 +1,6 @@
-"""What a proof says of a run, as arrays, and as a certificate that the adversary attacks."""
+"""What a proof says of a run, as arrays."""
 
-import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import scipy.linalg
@@ -12,9 +10,6 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import loop_of
-from noack.scenario.scenario import Scenario
-from noack.theory.certificates.conditions import Constants
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack_check.proof import Proof
 
 
@@ -55,44 +50,3 @@ def sizes_of(record: RunRecord, rest: Vector) -> Iterator[tuple[str, Vector, Vec
     predictions = {age_s: scipy.linalg.expm(loop.H * age_s) for age_s in np.unique(ages_s)}
     x_c = [predictions[age_s] @ state for age_s, state in zip(ages_s, ticks["x_c"] - rest, strict=True)]
     yield "e_c", t_s, np.linalg.norm((np.array(x_c).reshape(x.shape) - x) @ W.T, axis=1)
-
-
-def with_proven_bounds(
-    certificate: ScenarioCertificate, proof: Proof, resolved: Scenario
-) -> ScenarioCertificate:
-    """Return a certificate whose bounds are the proven ones, D₁ e^{−rt} + D₂."""
-    level = max(certificate.beta, certificate.floor if float(proof.rate.mid()) == 0 else 0.0) or 1.0
-
-    def constants(part: int, unit: float) -> Constants:
-        sizes = {}
-        for bound in proof.bounds:
-            if bound.from_start:
-                size = float((bound.decaying, bound.constant)[part].mid()) * (1 + 1e-9)
-                both = float((bound.decaying + bound.constant).mid())
-                if both <= sizes.get(bound.output, (math.inf, 0.0))[0]:
-                    sizes[bound.output] = (both, size)
-        value = {output: size for output, (_, size) in sizes.items()}
-        apart = None if proof.inter_event is None else float(proof.inter_event.mid()) or None
-        return Constants(
-            rate_per_s=float(proof.rate.mid()) if part == 0 else 0.0,
-            missing_events=resolved.network.mansd + 1,
-            delta=value.get("e_c", math.inf) / unit,
-            overshoot=value.get("e_s", math.inf) / unit,
-            input_error=math.inf,
-            start_error=math.inf,
-            state=value.get("x", math.inf),
-            state_weighted=math.inf,
-            mismatch=math.inf,
-            inter_event_s=apart,
-            loop_gain=0.0,
-        )
-
-    persistent = constants(1, 1.0)
-    return replace(
-        certificate,
-        constants=constants(0, level),
-        persistent_constants=persistent if persistent.state or persistent.overshoot else None,
-        floor_constants=None,
-        other=None,
-        void=None,
-    )

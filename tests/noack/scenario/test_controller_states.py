@@ -164,7 +164,7 @@ def test_an_observer_estimates_the_plant_and_takes_the_controllers_state_as_it_i
 def test_the_checker_reads_it_with_an_observer_about_a_reference() -> None:
     """ξ is measured, so the observer's error has none of it."""
     settings = {"observer": OBSERVER, "plant.measurement.C": [[1.0, 0.0]], "controller.reference": PIECES}
-    content = resolved_content(resolve(noack.load(LOOP, {**settings, "horizon_s": 12.0})), 2)
+    content = resolved_content(resolve(noack.load(LOOP, {**settings, "horizon_s": 12.0})))
     loop = read_loop(content, box=False, ideal=False)
     assert loop.fault() == ""
     assert loop.until == 12

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from noack.theory.certificates.scenario_certificates import own_plant_scope
 
 import noack
 from noack.core.errors import CallerError
@@ -15,7 +16,6 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
-from noack.theory.certificates.scenario_certificates import own_plant_scope
 from tests.helpers.shipped import shipped
 
 PERIODIC = {"policy": "periodic", "period_s": 0.05}

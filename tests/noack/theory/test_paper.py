@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from noack.theory.bounds.enclosure import response
 from scipy.linalg import expm
+from tests.noack.theory.certificates.certificate_kinds.policies import INSTANT
+from tests.noack.theory.certificates.certified_loops import certified_or_skipped
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.theory.certificates.conditions import NetworkConditions
-from noack.theory.bounds.enclosure import response
 from noack.theory.paper import (
     ErrorMonitor,
     InterEventTrajectory,
@@ -25,8 +27,6 @@ from noack.theory.paper import (
 from noack.trigger_policies.trigger_rule import TriggerRule
 from tests.helpers.example_rules import decaying_rule
 from tests.helpers.shipped import resolved
-from tests.noack.theory.certificates.certificate_kinds.policies import INSTANT
-from tests.noack.theory.certificates.certified_loops import certified_or_skipped
 from tests.oracles.continuous_loops import simulate_continuous_time
 from tests.oracles.lossy_loops import ROUNDING, SEARCH, System, networks, seeds, systems, times_s
 

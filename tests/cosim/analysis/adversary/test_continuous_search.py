@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from noack.theory.certificates.scenario_certificates import certify
 
 from cosim.analysis.adversary import WorstRun
 from cosim.analysis.adversary.loop_flows import Objective, evaluate
@@ -17,7 +18,6 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
-from noack.theory.certificates.scenario_certificates import certify
 from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenarios, simulate
 from tests.helpers.shipped import resolved as resolved_shipped
 

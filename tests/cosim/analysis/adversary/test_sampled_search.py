@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from noack.theory.certificates.scenario_certificates import certify
 from scipy.linalg import expm
 
 from cosim.analysis.adversary import Objective, conditions_of, find_worst
@@ -20,7 +21,6 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.scenario_certificates import certify
 from tests.helpers.example_rules import EXAMPLES
 
 OWN = {

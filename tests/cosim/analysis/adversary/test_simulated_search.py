@@ -1,12 +1,12 @@
 """The worst losses of plants that are not given by matrices."""
 
 import pytest
+from noack.theory.certificates.scenario_certificates import certify
 
 import noack
 from cosim.analysis.adversary import Objective, conditions_of, find_worst, find_worst_by_runs
 from cosim.analysis.certificates import certificates_of
 from noack.scenario.resolution import resolve
-from noack.theory.certificates.scenario_certificates import certify
 
 ALL = tuple(Objective)
 

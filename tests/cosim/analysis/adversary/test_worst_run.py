@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from noack.theory.certificates.scenario_certificates import certify
 from scipy.integrate import quad
 
 from cosim.analysis.adversary.loop_flows import Objective, ObjectiveValue, measure_of
 from cosim.analysis.adversary.worst_run import WorstRun, certified_value
 from cosim.simulation.continuous import continuous_loop_of
 from noack.theory.certificates.conditions import ideal_conditions
-from noack.theory.certificates.scenario_certificates import certify
 from tests.helpers.shipped import resolved
 
 WORST = WorstRun(

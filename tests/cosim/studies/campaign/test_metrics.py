@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from noack.theory.certificates.scenario_certificates import certify
 from scipy.stats import t as student
 
 from cosim.shipped_files import find_shipped
@@ -25,7 +26,6 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load as load_scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
-from noack.theory.certificates.scenario_certificates import certify
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 

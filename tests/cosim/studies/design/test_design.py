@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import Result
+from noack.theory.certificates.scenario_certificates import certify_box
 
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import run_batch, setting_of
@@ -21,7 +22,6 @@ from cosim.studies.design.design_space import families_of, lqr_gain
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.conditions import ideal_conditions
-from noack.theory.certificates.scenario_certificates import certify_box
 from tests.cosim.studies.design.conftest import LIMITS
 from tests.helpers.approved import compare_lines
 from tests.helpers.command_line import invoke
