@@ -46,7 +46,7 @@ SHORTER = {
     "design": ("--draws", "80"),
     "margin": ("--no-period", "--most", "2"),
     "doctor": ("--seconds", "0.1"),
-    "certify": ("--no-proofs",),
+    "certify": ("--no-search",),
 }
 """Arguments added to a command to shorten it; other tests cover reports, figures of pages and long runs."""
 

@@ -20,7 +20,7 @@ import noack
 
 run = noack.simulate(noack.load("lane_following", {"horizon_s": 1.0}))
 assert run.ok and run.replay().bit_exact
-assert noack.certify("double_integrator", proofs=False).schedule is not None
+assert noack.certify("double_integrator", search=False).schedule is not None
 """
 
 

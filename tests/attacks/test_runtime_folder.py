@@ -276,7 +276,7 @@ def test_a_file_that_grows_or_is_locked_follows_no_planted_name(
 def test_a_folder_that_is_another_users_link_is_not_written_to(common: Path, private: Path) -> None:
     (common / "tables").symlink_to(private.parent)
     os.chown(common / "tables", NOBODY, NOBODY, follow_symlinks=False)
-    words = ["certify", "double_integrator", "--no-proofs", "--tables", str(common / "tables")]
+    words = ["certify", "double_integrator", "--no-search", "--tables", str(common / "tables")]
     result = invoke(*words)
     assert result.exit_code == 1
     assert result.stderr.endswith(f"{common / 'tables'} is a symbolic link of another user\n")
@@ -286,7 +286,7 @@ def test_a_folder_that_is_another_users_link_is_not_written_to(common: Path, pri
 
 
 OUTPUTS: dict[str, tuple[str, ...]] = {
-    "--tables": ("certify", "double_integrator", "--no-proofs", "--tables", "{}/tables"),
+    "--tables": ("certify", "double_integrator", "--no-search", "--tables", "{}/tables"),
     "--out": ("measure", "rural_n8_10kmh", "--out", "{}/m.html"),
     "--write": ("measure", "rural_n8_10kmh", "--write", "{}/network.toml"),
     "--runs": ("simulate", "double_integrator", "--set", "horizon_s=0.1", "--runs", "{}"),

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 from flint import arb_mat, fmpq
-from noack.theory.certificates.refusals import refusals_about_reference
 
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
@@ -233,11 +232,9 @@ def test_the_setpoint_is_moved_to_0() -> None:
 def test_setpoints_that_noack_does_not_cover_are_refused() -> None:
     uncertain = ("controller.setpoint=[2.0, 0.0]", "plant.uncertainty_A=[[0.1, 0.0], [0.0, 0.0]]")
     resolved = first_loop("double_integrator", *uncertain)
-    assert list(refusals_about_reference(resolved)) == ["every plant of the uncertainty box"]
     with pytest.raises(RefusedError, match=r"controller.setpoint: not every plant"):
         read_loop(tables_of(resolved), box=True, ideal=False)
     pendulum = first_loop("unstable_pendulum", "controller.setpoint=[0.1, 0.0]")
-    assert len(refusals_about_reference(pendulum)) == 2
     with pytest.raises(RefusedError, match=r"controller.setpoint: it needs an input"):
         read_loop(tables_of(pendulum), box=False, ideal=False)
 

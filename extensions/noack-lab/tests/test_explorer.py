@@ -18,7 +18,7 @@ def test_results_are_those_of_the_library() -> None:
     run = noack.simulate_exactly(scenario)
     np.testing.assert_array_equal(explorer.run.transmissions, run.delivered)
     assert dict(explorer.run.facts)["longest loss burst"] == str(run.summary.longest_loss_burst)
-    certificate = noack.certify(scenario, proofs=False).schedule
+    certificate = noack.certify(scenario, search=False).schedule
     bound = explorer.certificate.curves[0]
     np.testing.assert_array_equal(bound.values, certificate.controller_error(bound.t_s))
     assert explorer.certificate.line.text.startswith("certified: the scenario's plant")

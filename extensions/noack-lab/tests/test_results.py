@@ -8,7 +8,7 @@ def test_the_lab_gives_the_answer_of_certify() -> None:
     """The model of the cart-pole has a certificate, the cart-pole has none; the car has its own."""
     for name in ("lane_following", "cart_pole", "kinematic_car", "lane_periodic"):
         scenario = noack.load(name)
-        answer, line = noack.certify(scenario, proofs=False).answer, guarantee_of(scenario).line
+        answer, line = noack.certify(scenario, search=False).answer, guarantee_of(scenario).line
         assert line.text.startswith(answer.text)
         assert line.tone == ("good" if answer.is_certified else "doubt")
 

@@ -66,9 +66,8 @@ SCENARIOS: dict[str, Call] = {
 THEORY: dict[str, Call] = {
     f"certify lane_periodic {OVERLOAD}": lambda: noack.certify(overloaded()),
     "certify lane_following --late -1": lambda: noack.certify("lane_following", late=-1),
-    "certify lane_following --weight best": lambda: noack.certify("lane_following", weight="best"),
-    "certify lane_following --no-proofs --tables run/record": lambda: noack.save_tables(
-        noack.certify("lane_following", proofs=False), "run/record"
+    "certify lane_following --no-search --tables run/record": lambda: noack.save_tables(
+        noack.certify("lane_following", search=False), "run/record"
     ),
     f"margin lane_periodic {OVERLOAD}": lambda: noack.margin(overloaded()),
     "margin priority_channel": lambda: noack.margin("priority_channel"),

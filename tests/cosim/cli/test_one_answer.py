@@ -19,35 +19,31 @@ def guarantee_line(scenario: str, **settings: object) -> str:
 
 @pytest.mark.parametrize("name", ["model_predictive", "lane_python_trigger"])
 def test_a_run_that_no_certificate_covers_says_why_as_certify_does(name: str) -> None:
-    refused = invoke("certify", name)
-    assert refused.exit_code == 2
-    reason = refused.stderr.removeprefix("noack: ").removesuffix("; no certificate covers this\n")
-    assert guarantee_line(name) == f"guarantee not checkable: no certificate: {reason}"
+    answer = noack.certify(name).answer
+    assert not answer.is_certified
+    assert guarantee_line(name) == f"guarantee not checkable: {answer.text}"
 
 
-@pytest.mark.parametrize(
-    ("name", "is_certified"), [("lane_following", True), ("cart_pole", False), ("kinematic_car", True)]
-)
+@pytest.mark.parametrize(("name", "is_certified"), [("lane_following", True), ("cart_pole", False)])
 def test_the_answer_of_certify_is_that_of_the_run(name: str, is_certified: bool) -> None:
-    answer = noack.certify(name, proofs=False).answer
+    answer = noack.certify(name, search=False).answer
     assert answer.is_certified == is_certified
     line = noack.simulate(noack.load(name, {"horizon_s": 1.0})).verdict[1]
     assert line.tone == (Tone.GOOD if is_certified else Tone.DOUBTFUL)
     if not is_certified:
-        reason = line.text.removeprefix("guarantee not checkable: no certificate: ")
-        assert answer.text.endswith(f": {reason}; only its model in its place has one")
+        assert line.text == f"guarantee not checkable: {answer.text}"
 
 
 @pytest.mark.parametrize(("period_s", "losses"), [(0.1, 0), (0.5, 4)])
 def test_the_answer_of_certify_is_that_of_margin(period_s: float, losses: int) -> None:
     """margin said of the first only that every pattern is stable."""
     scenario = noack.load("lane_periodic", {"trigger.period_s": period_s, "network.mansd": losses})
-    answer = noack.certify(scenario, proofs=False).answer
+    answer = noack.certify(scenario, search=False).answer
     assert answer.is_certified == (losses == 0)
     margin = noack.margin(scenario, most_m=1, period=False)
     assert margin.certificate == answer
     assert str(margin).splitlines()[-1] == (
-        f"noack certify --no-proofs, for at most M − 1 = {losses} consecutive losses: {answer.text}"
+        f"noack certify --no-search, for at most M − 1 = {losses} consecutive losses: {answer.text}"
     )
 
 

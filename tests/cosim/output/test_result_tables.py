@@ -54,7 +54,7 @@ def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> No
     margin = noack.margin("lane_periodic", most_m=2, period=False)
     for result, name in (
         (margin, "margin"), (noack.campaign(grid, workers=1), "campaign"),
-        (noack.certify("double_integrator", proofs=False), "certificates"),
+        (noack.certify("double_integrator", search=False), "certificates"),
         (noack.simulate(noack.load("double_integrator", {"horizon_s": 0.1})), "numbers"),
     ):  # fmt: skip
         files = noack.save_tables(result, tmp_path / name)

@@ -29,8 +29,8 @@ def run(simulated: noack.Run) -> Path:
     [
         ("summary", ["summary", "RUN"]),
         ("summary-verbose", ["summary", "RUN", "--verbose"]),
-        ("certify", ["certify", "lane_following", "--no-proofs"]),
-        ("certify-verbose", ["certify", "lane_following", "--no-proofs", "--verbose"]),
+        ("certify", ["certify", "lane_following", "--no-search"]),
+        ("certify-verbose", ["certify", "lane_following", "--no-search", "--verbose"]),
         ("margin", ["margin", "lane_periodic", "--most", "3", "--no-period"]),
     ],
 )  # fmt: skip

@@ -8,16 +8,15 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from noack.theory.certificates.scenario_certificates import certify
 
 from cosim.analysis.adversary import WorstRun
 from cosim.analysis.adversary.loop_flows import Objective, evaluate
 from cosim.analysis.adversary.pattern_search import PatternSearch, search_tree
 from cosim.analysis.adversary.scenario_search import find_worst as find_any
+from cosim.analysis.scenario_certificates import quick_certificate
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from noack.theory.certificates.conditions import ideal_conditions
 from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenarios, simulate
 from tests.helpers.shipped import resolved as resolved_shipped
 
@@ -33,8 +32,8 @@ def signed(worst: WorstRun) -> float:
 
 
 def rate_of(resolved: Scenario) -> float | None:
-    constants = certify(resolved, ideal_conditions(resolved)).constants
-    return None if constants is None else constants.rate_per_s
+    proven = quick_certificate(resolved, ideal=True).proven
+    return None if proven is None else proven.rate_per_s
 
 
 @given(resolved=scenarios(5, mansd=2, window=(2, 5), recovery=2))
@@ -81,7 +80,8 @@ def test_a_certificate_that_forgets_a_dropout_is_refuted() -> None:
     @given(resolved=scenarios(16, mansd=1, window=(1, 1), n=2, alpha_share=0.2))
     @settings(MANY, max_examples=4)
     def attempt(resolved: Scenario) -> None:
-        broken = certify(resolved, ideal_conditions(resolved)._replace(dropouts=0))
+        without = resolved.network.model_copy(update={"mansd": 0})
+        broken = quick_certificate(resolved.model_copy(update={"network": without}), ideal=True)
         worst = find_worst(resolved, Objective.ERROR, certificate=broken, most_nodes=2000, beam=0)
         refuted.append(worst.breaches)
 

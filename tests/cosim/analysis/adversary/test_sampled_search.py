@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from noack.theory.certificates.scenario_certificates import certify
 from scipy.linalg import expm
 
-from cosim.analysis.adversary import Objective, conditions_of, find_worst
+from cosim.analysis.adversary import Objective, find_worst
 from cosim.analysis.adversary.loop_flows import Pattern, SampledFlow, run_sampled
 from cosim.analysis.adversary.worst_disturbances import disturbance_bounds
+from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.record.run_record import RunRecord
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate
@@ -20,7 +20,7 @@ from noack.core.errors import CallerError
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.certified_bounds import Quantity, ScenarioCertificate
 from tests.helpers.example_rules import EXAMPLES
 
 OWN = {
@@ -93,9 +93,9 @@ def value_of(
     if objective is Objective.COST:
         return float((x[1:] ** 2).sum() * STEP_S)
     level = np.ones(len(x))
-    if certificate.constants is not None:
-        is_state = objective is Objective.STATE
-        bound = certificate.state(t_s) if is_state else certificate.controller_error(t_s)
+    quantity: Quantity = "x" if objective is Objective.STATE else "e_c"
+    if certificate.has(quantity):
+        bound = certificate.bound(t_s, quantity)
         level = bound / bound[0]
     if objective is Objective.STATE:
         return float((np.linalg.norm(x, axis=1) / level).max())
@@ -120,7 +120,7 @@ def test_the_search_finds_the_worst_of_all_patterns(policy: str, mode: str) -> N
     events = max((event_steps(run(resolved, lost)[0]) for lost in ((), (True,) * 100)), key=len)
     if len(events) > MOST_EVENTS:
         resolved = scenario_of(trigger, mode=mode, horizon_s=events[MOST_EVENTS] * STEP_S)
-    certificate = certify(resolved, conditions_of(resolved, continuous=False))
+    certificate = quick_certificate(resolved)
     runs = list(every_run(resolved))
     assert len(runs) > 4
     for objective in Objective:
@@ -163,7 +163,7 @@ def test_the_search_finds_the_worst_of_all_patterns(policy: str, mode: str) -> N
 def test_a_pattern_makes_the_run_of_the_machines(sections: dict[str, Any], plant_hz: float) -> None:
     sections = {**sections, "plant": sections.get("plant", {}) | {"rate_hz": plant_hz}}
     resolved = scenario_of({"policy": "mixed", "sigma": 0.05, "epsilon": 0.05}, **sections)
-    certificate = certify(resolved, conditions_of(resolved, continuous=False))
+    certificate = quick_certificate(resolved)
     loop = SampledLoop(resolved)
     lost = tuple((np.random.default_rng(1).uniform(size=100) < 0.5).tolist())
     record, delivered = run(resolved, lost, loop.delay_ns)
@@ -204,7 +204,7 @@ def test_the_found_signs_of_the_disturbances_are_the_worst_of_all(
     """Events every 0.15 s, whatever is measured: so the worst signs are those of the responses."""
     periodic = {"policy": "periodic", "period_s": 0.15}
     resolved = scenario_of(periodic, horizon_s=0.35, network={"mansd": 0}, **sections)
-    certificate = certify(resolved, conditions_of(resolved, continuous=False))
+    certificate = quick_certificate(resolved)
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
     push, noise = (np.abs(part) for part in flow.loop.disturbances)
     bounds = disturbance_bounds(resolved)

@@ -1,11 +1,11 @@
 """The worst losses of plants that are not given by matrices."""
 
 import pytest
-from noack.theory.certificates.scenario_certificates import certify
 
 import noack
-from cosim.analysis.adversary import Objective, conditions_of, find_worst, find_worst_by_runs
+from cosim.analysis.adversary import Objective, find_worst, find_worst_by_runs
 from cosim.analysis.certificates import certificates_of
+from cosim.analysis.scenario_certificates import quick_certificate
 from noack.scenario.resolution import resolve
 
 ALL = tuple(Objective)
@@ -13,7 +13,7 @@ ALL = tuple(Objective)
 
 def test_runs_of_a_linear_plant_have_the_values_of_the_linear_search() -> None:
     resolved = resolve(noack.load("unstable_pendulum", {"horizon_s": 2.0}))
-    certificate = certify(resolved, conditions_of(resolved, continuous=False))
+    certificate = quick_certificate(resolved)
     aims = (Objective.ERROR, Objective.STATE)
     by_runs = find_worst_by_runs(resolved, aims, certificate, most_runs=40).objectives
     for aim, found in zip(aims, by_runs, strict=True):
@@ -32,10 +32,9 @@ def test_runs_of_a_linear_plant_have_the_values_of_the_linear_search() -> None:
 def test_a_plant_of_equations_is_searched_by_runs_within_its_guarantee() -> None:
     outputs = [{"name": "angle", "row": [1.0, 0.0]}]
     scenario = noack.load("sine_pendulum", {"horizon_s": 1.5, "outputs": outputs})
-    results, resolved = certificates_of(scenario, of_model=True), resolve(scenario)
+    results, resolved = certificates_of(scenario), resolve(scenario)
     results.prove(conditions=("schedule",))
-    certificate = results.of_own_plant
-    assert certificate is not None
+    certificate = results.schedule
     assert certificate.proven is not None
     found, shares = find_worst_by_runs(resolved, ALL, certificate, most_runs=24)
     assert [worst.objective for worst in found] == list(ALL)

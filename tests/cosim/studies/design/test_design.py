@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import Result
-from noack.theory.certificates.scenario_certificates import certify_box
 
+from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
@@ -21,7 +21,6 @@ from cosim.studies.design.design_search import DesignLimits, DesignResult, desig
 from cosim.studies.design.design_space import families_of, lqr_gain
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import dumps, load
-from noack.theory.certificates.conditions import ideal_conditions
 from tests.cosim.studies.design.conftest import LIMITS
 from tests.helpers.approved import compare_lines
 from tests.helpers.command_line import invoke
@@ -66,7 +65,7 @@ def run_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Design:
 
 
 def paper_certificate(path: Path) -> dict[str, Any]:
-    result = invoke("certify", path, "--no-proofs", "--json")
+    result = invoke("certify", path, "--no-search", "--json")
     assert result.exit_code == 0
     certificates = json.loads(result.stdout)["certificates"]
     return [certificate for certificate in certificates if certificate["under"] == "paper"][-1]
@@ -98,23 +97,23 @@ def test_check_and_certify_accept_the_written_scenario(
     assert scenario["trigger"]["alpha_per_s"] == best["alpha_per_s"]
     certificate = paper_certificate(out)
     assert "box" in certificate["scope"]
-    assert certificate["constants"]["state"] == pytest.approx(best["bounds"]["state"])
+    assert sum(certificate["proven"]["bounds"]["x"].values()) == pytest.approx(best["bounds"]["state"])
 
 
 @pytest.mark.usefixtures("no_drawing")
 def test_a_chosen_norm_is_certified_as_written(scalar_file: Path, tmp_path: Path, run_design: Design) -> None:
     out = tmp_path / "chosen.toml"
     result = run_design(
-        scalar_file, "--settling", "4", "--quantile", "0.7", "--draws", "40", "--weights", "chosen",
+        scalar_file, "--settling", "4", "--quantile", "0.7", "--draws", "40", "--weights", "contracting",
         "--bound", "error=0.3", "--bound", "state=2",
         "--out", str(out), "--json",
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr
     best = json.loads(result.stdout)["best"]
-    assert best["weight"] == "chosen"
+    assert best["weight"] == "contracting"
     assert best["W"] == [list(row) for row in load(out).decaying.weight or ()]
-    delta = paper_certificate(out)["constants"]["delta"]
-    assert best["bounds"]["error"] == pytest.approx(delta * best["beta"] / abs(best["W"][0][0]))
+    error = sum(paper_certificate(out)["proven"]["bounds"]["e_c"].values())
+    assert best["bounds"]["error"] == pytest.approx(error / abs(best["W"][0][0]))
     assert best["bounds"]["error"] <= 0.3
     assert best["bounds"]["state"] <= 2
 
@@ -174,12 +173,10 @@ def test_the_chosen_design_is_certified_as_required(result: DesignResult, tmp_pa
     path = tmp_path / "chosen.toml"
     path.write_text(dumps(result.scenario))
     resolved = resolve(load(path))
-    certificate = certify_box(resolved, ideal_conditions(resolved))
-    assert certificate is not None
-    assert certificate.constants is not None
+    certificate = quick_certificate(resolved, "box", ideal=True)
     weight = resolved.decaying.weight
     smallest = 1.0 if weight is None else np.linalg.svd(np.array(weight), compute_uv=False)[-1]
-    bound = certificate.constants.delta * resolved.decaying.beta / smallest
+    bound = float(certificate.controller_error(np.zeros(1))[0]) / smallest
     assert bound <= LIMITS.bounds["error"]
     # The bound is the active limit: without it a cheaper design exists.
     assert result.bounds is not None
