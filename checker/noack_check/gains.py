@@ -6,7 +6,7 @@ With p = u − Kx and E = A + BK − H the loop obeys, between events,
 
 where ω is what a plant of the box adds, |ω_i| ≤ Σ_j |half_A_ij x_j| + |half_B_ij u_j|. Before the first
 input, which acts within t_a, u = 0 and p = −Kx. In coordinates T of the inputs, p stands for Tp, and B for
-BT⁻¹.
+BT⁻¹. About a reference, −Bu_r is added to ẋ then: one more column, which acts up to t_a.
 
 *Units.* A bound is D₁ f₁ + D₂ f₂, f₁ = e^{−rt} and f₂ = 1. The start and the level of the threshold are of
 unit f₁, what is constant of f₂ (and all if f₁ = f₂). Each unit has inequalities of its own. In those of f₁
@@ -120,7 +120,7 @@ def read_witness(loop: Loop, table: Mapping[str, object]) -> Witness:
 def require_covered(loop: Loop) -> None:
     """Raise RejectedError if the argument does not cover a loop: its rule, or unknown loads."""
     n, rule = loop.n, loop.rule
-    if loop.loads or loop.push_before_input is not None or rule.memory is not None or rule.of_input:
+    if loop.loads or rule.memory is not None or rule.of_input:
         raise RejectedError("gains: not with loads, nor a rule with a memory or of the input")
     if loop.times.period > 0:
         return
@@ -209,6 +209,9 @@ class UnitGains:
         if unit.has_constants:
             for i, size in enumerate(loop.sizes):
                 yield Source(columns_of(loop.pushes, [i]), {"1": size}, {}, {"1": size}, is_outside=True)
+        if loop.push_before_input is not None and unit.has_start:  # it acts up to t_a, where f₁ has fallen
+            size = {"1": (arb(loop.times.start) * unit.rate).exp()}
+            yield Source(loop.push_before_input, {}, size, size, is_outside=True)
 
     def growth(self, until: arb) -> list[Response]:
         """Return the growth of W e_s within a time, from W⁻¹ and by each source."""

@@ -128,7 +128,7 @@ def conclude(
             bounds += [Bound(output, arb(0), constant, False) for output, (_, constant) in of_state]
     if not all(size.is_finite() for bound in bounds for size in (bound.decaying, bound.constant)):
         raise RejectedError("bounds: not finite")
-    is_moved = loop.loads > 0 or loop.until is not None
+    is_moved = loop.loads > 0 or loop.until is not None or loop.push_before_input is not None
     if is_moved and any(bound.output.startswith("u[") for bound in bounds):
         raise RejectedError("u: about a reference, or where the loop rests, the input is not an output")
     return Proof(rate, tuple(_about(loop, bound) for bound in bounds), apart, first, is_quiet)

@@ -63,6 +63,11 @@ class Segment(NamedTuple):
         return Segment(self.begin, self.polynomial - P, self.hz, self.sines - S, self.cosines - C)
 
     @property
+    def is_constant(self) -> bool:
+        """Whether x_r and u_r are a set-point."""
+        return self.polynomial.ncols() == 1 and not self.hz
+
+    @property
     def derivative(self) -> "Segment":
         """The derivative, of as many powers."""
         P, width = self.polynomial, self.polynomial.nrows()

@@ -1,9 +1,8 @@
 """From a resolved scenario, as ``noack check --resolved`` prints it, to the loop that statements are about.
 
 Floats are the exact binary values that noack runs with. A scenario with a key that :mod:`.keys`
-refuses has no loop. What is moved to 0 is the set-point x_r: with Âx_r = 0 the models rest at it without
-an input, and what is left of the plant is a constant disturbance A x_r. A reference that changes over time
-is moved to 0, too: see :mod:`.reference`.
+refuses has no loop. A reference, or a set-point, which is a constant one, is moved to 0: see
+:mod:`.reference`.
 """
 
 import math
@@ -85,9 +84,8 @@ def read_loop(
     if enclosed is None:
         own = own._replace(A=_matrix(plant, "plant.A"), B=_matrix(plant, "plant.B"))
     plants = _box(plant, A, B, own) if box else own
-    x_r = _setpoint(resolved, A, plants)
     _choice(_table(resolved, "network"), "network.initial_sync", ("first_packet", "known_state"))
-    pushes = [*_disturbances(plant, matrix(plants.B), matrix(plants.half_B)), *_at_rest(plants.A, x_r)]
+    pushes = [*_disturbances(plant, matrix(plants.B), matrix(plants.half_B))]
     weight = _weight(trigger, n)
     rule, times = _rule(trigger, weight, model), _times(resolved, trigger, ideal=ideal)
     for name, least in (longer or {}).items():
@@ -110,7 +108,7 @@ def read_loop(
         outputs=_outputs(resolved, n),
         losses=most_losses(resolved),
         times=times,
-        **_start(resolved, plants, x_r),
+        **_start(resolved, plants),
     )
     if enclosed is not None and loop.loads:
         raise RefusedError("model.load_states: not covered on a region")
@@ -155,7 +153,7 @@ def _about_reference(loop: Loop, resolved: Table) -> Loop:
         sizes=(*loop.sizes, *[arb(1)] * len(columns)),
         push_before_input=before if loop.push_before_input is not None or not is_zero(before) else None,
         observer=None if loop.observer is None else loop.observer._replace(unfelt=len(columns)),
-        until=about.until,
+        until=None if len(segments) == 1 and segments[0].is_constant else about.until,
         offset=about.offset,
     )
 
@@ -233,11 +231,8 @@ def _with_equations(loop: Loop, resolved: Table, enclosed: Enclosed) -> Loop:
     n, m = loop.n, plants.B.ncols()
     if loop.observer is not None:
         raise RefusedError("observer: not covered with a plant's equations")
-    if loop.until is not None:
+    if "reference" in _optional_table(resolved, "controller"):
         raise RefusedError("controller.reference: not covered with a plant's equations")
-    setpoint = _optional_table(resolved, "controller").get("setpoint")
-    if setpoint is not None and any(_row({"setpoint": setpoint}, "controller.setpoint")):
-        raise RefusedError("controller.setpoint: not covered with a plant's equations")
     plant, nothing = _table(resolved, "plant"), Along(arb_mat(1, n + m), arb(0))
     disturbances, room = list(_disturbances(plant, plants.B, plants.half_B)), _input_room(plant, m)
     is_moved = any(each > 0 for each in room)
@@ -278,8 +273,8 @@ class _Start(TypedDict, total=False):
     push_before_input: arb_mat
 
 
-def _start(resolved: Table, plants: _Plants, x_r: Sequence[float]) -> _Start:
-    """Return where the loop starts, in coordinates in which its set-point and its loads are 0.
+def _start(resolved: Table, plants: _Plants) -> _Start:
+    """Return where the loop starts, in coordinates in which its loads are 0.
 
     With u = Kx + K_d d and a constant d the closed loop rests at Πd, where (A + BK)Π + E + BK_d = 0. There
     the plant, both models and the observer rest together, at (Πd, d). So the loop about this point is the
@@ -290,9 +285,7 @@ def _start(resolved: Table, plants: _Plants, x_r: Sequence[float]) -> _Start:
     x_0 = matrix([[value] for value in _row(plant, "plant.initial_state")])
     k = _whole(model, "model.load_states") if "load_states" in model else 0
     if not k:
-        return {"start": x_0 - matrix([[value] for value in x_r])}
-    if any(x_r):
-        raise RefusedError("controller.setpoint: with model.load_states not covered")
+        return {"start": x_0}
     _require_unknown_start(resolved, "model.load_states")  # loads are not known
     n = len(plants.A) - k
     if n < 1:
@@ -580,7 +573,7 @@ def times_between_events(resolved: Table) -> tuple[int, int]:
     return min(least, times.longest), times.longest
 
 
-_OF_REST = ("setpoint", "safe_input", "update_timeout_s", "timeout_input")
+_OF_REST = ("reference", "safe_input", "update_timeout_s", "timeout_input")
 """Settings of the controller that do not change by what the difference of two runs is multiplied."""
 
 
@@ -734,30 +727,6 @@ def _disturbances(plant: Table, B: arb_mat, half_B: arb_mat) -> Iterator[list[ar
                 sizes = _product(half_B, [abs(v) for v in signal])
                 for i, size in enumerate(sizes):  # B of the plants is not known
                     yield from _nonzero([size if k == i else arb(0) for k in range(n)])
-
-
-def _setpoint(resolved: Table, A: Rows, plants: _Plants) -> Sequence[float]:
-    """Return x_r, at which the model rests without an input."""
-    controller = _table(resolved, "controller")
-    n = len(A)
-    x_r = _row(controller, "controller.setpoint") if "setpoint" in controller else [0.0] * n
-    if len(x_r) != n:  # with loads it has fewer
-        raise RefusedError(f"controller.setpoint: not {n} numbers")
-    if any(sum(Fraction(a) * Fraction(v) for a, v in zip(row, x_r, strict=True)) for row in A):
-        raise RefusedError("controller.setpoint: it needs an input, which is 0 until the first one arrives")
-    if any(h and v for row in plants.half_A for h, v in zip(row, x_r, strict=True)):
-        raise RefusedError("controller.setpoint: not every plant within the uncertainty rests there")
-    return x_r
-
-
-def _at_rest(A: Rows, x_r: Sequence[float]) -> Iterator[list[arb]]:
-    """Yield A x_r, the constant disturbance of a plant that does not rest at the set-point."""
-    yield from _nonzero(
-        [
-            number(sum((Fraction(a) * Fraction(v) for a, v in zip(row, x_r, strict=True)), Fraction(0)))
-            for row in A
-        ]
-    )
 
 
 def _noise(resolved: Table, n: int) -> arb_mat:

@@ -49,8 +49,8 @@ def origin_text(scenario: Mapping[str, object], loop: Loop) -> str:
     if loop.loads:
         return "x and outputs count from where the loop rests under its constant loads"
     controller = scenario.get("controller")
-    setpoint = controller.get("setpoint", []) if isinstance(controller, Mapping) else []
-    return "x and outputs count from the set-point" if any(setpoint) else ""
+    is_moved = isinstance(controller, Mapping) and "reference" in controller
+    return "x and outputs count from the set-point" if is_moved and loop.until is None else ""
 
 
 def equations_text(document: Mapping[str, object]) -> str:

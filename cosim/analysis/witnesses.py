@@ -19,7 +19,7 @@ from noack.core.linear_systems import Vector
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations, trace
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.conditions import with_stated_times
+from noack.theory.certificates.conditions import with_stated_numbers
 from noack.theory.certificates.plant_equations import equations_of
 from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.witnesses.documents import Witness, find_witness, witness_by_gains
@@ -150,7 +150,7 @@ def require_covered(resolved: Scenario) -> None:
 
 def resolved_content(resolved: Scenario) -> dict[str, object]:
     """Return the tables of a resolved scenario, as `noack check --resolved` prints them."""
-    return dict(with_stated_times(resolved).content())
+    return dict(with_stated_numbers(resolved).content())
 
 
 def with_lateness(resolved: Scenario, late_periods: int) -> Scenario:

@@ -17,7 +17,7 @@ from noack.scenario.scenario import Scenario, loop_names
 from noack.scenario.scenario_file import dumps
 from noack.scenario.uneven_periods import uneven_periods
 from noack.theory.certificates.assumptions import assumptions
-from noack.theory.certificates.conditions import with_stated_times
+from noack.theory.certificates.conditions import with_stated_numbers
 from noack.trigger_policies.trigger_rule import CodedPolicy
 from plant_server.plant import system_of
 
@@ -47,7 +47,7 @@ def check_scenario(loaded: Scenario, *, json: bool) -> None:
 
 def print_resolved(loaded: Scenario, *, json: bool) -> None:
     """Print a scenario of one loop with numbers only: what a statement about it depends on."""
-    stated = with_stated_times(resolve(loaded))
+    stated = with_stated_numbers(resolve(loaded))
     if json:
         print_json(stated.model_dump(mode="json"))
     else:

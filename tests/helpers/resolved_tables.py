@@ -6,7 +6,7 @@ from typing import Any
 from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps
-from noack.theory.certificates.conditions import with_stated_times
+from noack.theory.certificates.conditions import with_stated_numbers
 from tests.helpers.shipped import shipped
 
 
@@ -17,7 +17,7 @@ def first_loop(name: str, *settings: str) -> Scenario:
 
 def tables_of(resolved: Scenario) -> dict[str, Any]:
     """Return what ``noack check --resolved`` prints of a resolved scenario, parsed."""
-    return tomllib.loads(dumps(with_stated_times(resolved)))
+    return tomllib.loads(dumps(with_stated_numbers(resolved)))
 
 
 def resolved_tables(name: str, *settings: str) -> dict[str, Any]:

@@ -14,10 +14,12 @@ from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.core.periods import exact_ns
+from noack.core.references import Reference
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
-from noack.scenario.resolution import loop_of
+from noack.references.segment import SolutionSegment
+from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows, Table
 
@@ -140,11 +142,12 @@ def certified_delay_s(resolved: Scenario) -> float:
     return resolved.network.link.longest_delay_s if given_s is None else given_s
 
 
-def with_stated_times(resolved: Scenario) -> Scenario:
-    """Return a resolved scenario with numbers in place of the times that follow from other keys.
+def with_stated_numbers(resolved: Scenario) -> Scenario:
+    """Return a resolved scenario with numbers in place of what follows from other keys.
 
-    These are the network delay that certificates allow for, and the watchdog's timeout; their effect
-    stays the same. The delay in a queue is not known: if it is not stated, it stays so.
+    These are the network delay that certificates allow for, the watchdog's timeout, and the input of a
+    set-point, which becomes a constant reference; their effect stays the same. The delay in a queue is not
+    known: if it is not stated, it stays so.
     """
     update: Table = {}
     if not resolved.network.link.queues:
@@ -153,6 +156,11 @@ def with_stated_times(resolved: Scenario) -> Scenario:
     timeout_s = resolved.timing.actuation_timeout_ns / NS_PER_S
     watchdog = resolved.plant.watchdog.model_copy(update={"timeout_s": timeout_s})
     update["plant"] = resolved.plant.model_copy(update={"watchdog": watchdog})
+    if (setpoint := setpoint_of(resolved)) is not None:
+        states = resolved.model.followed_states
+        (segment,) = Reference.constant(setpoint[0][:states], setpoint[1]).segments
+        pieces = {"reference": (SolutionSegment.of(segment, states),), "setpoint": None}
+        update["controller"] = resolved.controller.model_copy(update=pieces)
     return resolved.model_copy(update=update)
 
 
