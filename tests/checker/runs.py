@@ -43,6 +43,8 @@ class _Plant:
         self.B = floats(loop.B) + signs[1] * floats(loop.half_B)
         self.outputs = floats(loop.output_rows)
         self.pushes = floats(loop.pushes) * np.array([float(size.mid()) for size in loop.sizes])
+        push = loop.push_before_input
+        self.early = np.zeros(self.n) if push is None else floats(push)[:, 0]
         self.step = functools.lru_cache(4096)(self._step)
         self.predict = functools.lru_cache(4096)(lambda dt: np.asarray(expm(self.H * dt)))
         self.input_matrix = functools.lru_cache(16)(self._input_matrix)
@@ -57,7 +59,7 @@ class _Plant:
         F[3 * n : 4 * n, 3 * n : 4 * n] = self.A
         F[3 * n : 4 * n, 2 * n : 3 * n] = self.B @ self.input_matrix(age)
         F[:n, :n], F[:n, 2 * n : 3 * n] = self.A, self.B @ self.input_matrix(age)
-        F[:n, -1] = self.pushes @ np.array(signs)
+        F[:n, -1] = self.pushes @ np.array(signs) + (self.early if age is None else 0.0)
         F[n : 2 * n, n : 2 * n] = F[2 * n : 3 * n, 2 * n : 3 * n] = self.H
         return np.asarray(expm(F * dt))
 

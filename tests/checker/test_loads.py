@@ -71,7 +71,6 @@ def test_a_loop_with_a_reference_is_read_about_its_rest_and_the_reference() -> N
     ("setting", "message"),
     [
         ("plant.load_changes=[{at_s=1.0,load=[0.1]}]", "a constant one"),
-        ("controller.setpoint=[0.5,0.0]", "controller.setpoint"),
         ("plant.measurement.noise_bound=[0.01,0.01]", "first_gain|observer"),
     ],
 )

@@ -219,24 +219,28 @@ def test_a_disturbance_of_the_input_acts_through_each_B_of_the_box() -> None:
     np.testing.assert_allclose(floats(loop.pushes), np.hstack([-2.0 * model_B, [[0.0], [0.5]]]))
 
 
-def test_the_setpoint_is_moved_to_0() -> None:
-    resolved = first_loop("double_integrator", "controller.setpoint=[2.0, 0.0]")
+def test_the_setpoint_is_moved_to_0_until_the_first_input_its_input_is_missing() -> None:
+    resolved = first_loop("unstable_pendulum", "controller.setpoint=[0.1, 0.0]", 'plant.draw="nominal"')
     loop = read_loop(tables_of(resolved), box=False, ideal=False)
-    moved = about_reference(resolved)
-    np.testing.assert_allclose(floats(loop.start)[:, 0], moved.plant.initial_state)
-    extents = [entry.extent() for entry in moved.plant.disturbances]
-    expected = np.hstack(extents) if extents else np.zeros((2, 0))
-    np.testing.assert_allclose(floats(loop.pushes), expected, rtol=1e-12)
+    np.testing.assert_allclose(floats(loop.start)[:, 0], about_reference(resolved).plant.initial_state)
+    u_r = -9.81 * 0.1
+    assert loop.push_before_input is not None
+    np.testing.assert_allclose(floats(loop.push_before_input)[:, 0], [0.0, -u_r])
+    assert loop.until is None
+    assert np.abs(floats(loop.pushes)).max(initial=0.0) < 1e-9  # the model rests there, up to rounding
 
 
-def test_setpoints_that_noack_does_not_cover_are_refused() -> None:
+def test_plants_of_a_box_are_pushed_where_they_do_not_rest() -> None:
     uncertain = ("controller.setpoint=[2.0, 0.0]", "plant.uncertainty_A=[[0.1, 0.0], [0.0, 0.0]]")
-    resolved = first_loop("double_integrator", *uncertain)
-    with pytest.raises(RefusedError, match=r"controller.setpoint: not every plant"):
-        read_loop(tables_of(resolved), box=True, ideal=False)
-    pendulum = first_loop("unstable_pendulum", "controller.setpoint=[0.1, 0.0]")
-    with pytest.raises(RefusedError, match=r"controller.setpoint: it needs an input"):
-        read_loop(tables_of(pendulum), box=False, ideal=False)
+    loop = read_loop(tables_of(first_loop("double_integrator", *uncertain)), box=True, ideal=False)
+    assert np.abs(floats(loop.pushes)).sum(axis=1) == pytest.approx([0.2, 0.0])
+
+
+def test_a_setpoint_itself_is_refused() -> None:
+    tables = tables_of(first_loop("double_integrator"))
+    tables["controller"]["setpoint"] = [2.0, 0.0]
+    with pytest.raises(RefusedError, match=r"controller.setpoint = .*: a resolved scenario has it as"):
+        read_loop(tables, box=False, ideal=False)
 
 
 def test_a_watchdog_that_may_act_is_refused() -> None:
