@@ -1,23 +1,17 @@
-"""What is certified of a loop, and why, in five parts, to be read in this order.
+"""What is guaranteed of a loop, and why, in five parts, to be read in this order.
 
 1. ``paper.py``: the identity (I1), the bounds of ‖e_c‖ that follow from it along a run, and the
    paper's theorems as printed.
-2. ``bounds``: the numbers on which certificates rest. Suprema and integrals of responses, enclosed
-   between samples; the gains of a loop; what a trigger and the disturbances contribute.
-3. ``certificates``: the inequalities between all signals of a loop, their solution, and what it
-   guarantees of a scenario, with its assumptions.
-4. ``witnesses``: the search for what noack-check proves: bounds, regions, and the growth of a loop
-   whose sensor is time-triggered, or has a longest time between events. ``time_triggered`` has the
-   maps of such loops.
+2. ``witnesses``: the search for what noack-check proves: bounds, regions, and the growth of a loop
+   whose sensor is time-triggered, or has a longest time between events.
+3. ``certificates``: what was proven of a scenario, as bounds over time, with its conditions and assumptions.
+4. ``time_triggered``: the maps of loops whose sensor transmits at times that do not depend on measurements.
 5. ``random_losses``: what holds if nothing limits the number of consecutive losses.
 
-``coverage.py`` and ``keys.toml`` say which settings of a scenario all this covers.
+``coverage.py`` says which loops the paper's identities, exact simulation and mean costs cover; what proofs
+cover is in ``checker/noack_check/keys.toml``. ``response_bounds.py`` encloses responses of linear systems.
 
-The docstring of each part has its chain of arguments. Labels such as eq:LossEv3 are those of the
-paper's source. docs/theory.md states the results, docs/derivations.md has the proofs and a table of
-the files. Modules are imported in the order bounds, paper, certificates and
-time_triggered, random_losses and witnesses: the paper's formulas need enclosed suprema, too.
-
-Modules of scipy are imported in the functions that use them: their import takes longer than that of
-everything else here, and most certificates do not need them.
+Each bound of a certificate was verified by :mod:`noack_check`, whose modules have the argument. Labels such
+as eq:LossEv3 are those of the paper's source. docs/theory.md states the results, docs/derivations.md has the
+proofs and a table of the files.
 """
