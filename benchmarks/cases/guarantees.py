@@ -18,7 +18,7 @@ from noack.impairments.target_loss import expected_loss
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
-from noack.theory.response_bounds import lyapunov_decay
+from noack.theory.trigger_norm import input_norm
 from tests.oracles.loss_language import is_allowed, longest_burst, outcomes_of
 
 DECISIONS = 100_000_000
@@ -127,14 +127,12 @@ def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]
 
 
 def loop_named(name: str, horizon_s: float, norm: str) -> Scenario:
-    """Return a shipped scenario with the paper's trigger in a norm, "contracting" or "identity"."""
+    """Return a shipped scenario with the paper's trigger in a norm, "input" or "identity"."""
     resolved = resolve(load(find_scenario(name), [f"horizon_s={horizon_s}"]))
     paper, loop = resolved.decaying, loop_of(resolved)
     weight = np.eye(loop.n)
-    if norm == "contracting":
-        form, _ = lyapunov_decay(loop.H, paper.alpha_per_s)
-        weight = np.asarray(np.linalg.cholesky(form).T)
-        weight /= np.linalg.det(weight) ** (1 / loop.n)
+    if norm == "input":
+        weight = input_norm(loop.H, loop.K, paper.alpha_per_s)
     rows = tuple(map(tuple, weight.tolist()))
     return resolved.model_copy(update={"trigger": paper.model_copy(update={"weight": rows})})
 
@@ -166,15 +164,13 @@ def row_of(name: str, worst: WorstRun) -> Row:
 
 
 @benchmark("tightness", "The adversary against the certificates")
-def tightness(
-    loop: str = "", policy: str = "", search_s: float = 5.0, norm: str = "contracting"
-) -> Iterator[Row]:
+def tightness(loop: str = "", policy: str = "", search_s: float = 5.0, norm: str = "input") -> Iterator[Row]:
     """Search the largest share of each certificate's bounds that the worst losses use, by policy.
 
-    The bounds are those that need no search; the norm falls along the models.
+    The bounds are those that need no search; the norm counts errors by what they do to u.
     """
-    if norm not in ("contracting", "identity"):
-        raise MeasurementError(f"no norm {norm}: contracting, or identity")
+    if norm not in ("input", "identity"):
+        raise MeasurementError(f"no norm {norm}: input, or identity")
     for name in (loop,) if loop else LOOPS:
         announce(f"{name}: the norm")
         scenario = loop_named(name, search_s, norm)

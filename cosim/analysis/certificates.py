@@ -74,6 +74,10 @@ class Certificates:
         CallerError: its settings change.
     """
 
+    scenario: Scenario
+    """The resolved scenario."""
+    setpoint: tuple[float, ...] | None
+    """x_r; all bounds of x are those of x − x_r. None: 0."""
     unproven: Sequence[Unproven] = ()
     """Plants and conditions of which nothing is proven, with the reasons."""
 
@@ -83,7 +87,6 @@ class Certificates:
         self.threshold_advice = dict[str, str]()
         """By output: what brings it within its allowed error, see :meth:`advise`."""
         self.setpoint = scenario.controller.setpoint
-        """x_r; all bounds of x are those of x − x_r. None: 0."""
         self.follows_reference = scenario.controller.reference is not None
         """Whether x is the distance from a reference that changes over time."""
         self.jump_s = jump_s(scenario)

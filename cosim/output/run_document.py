@@ -131,7 +131,7 @@ def _notes_on_claims(claims: Sequence[Claim]) -> Iterator[Sentence]:
             role=SentenceRole.NOTE,
             text="share used: largest share of the bound reached during the run; a bound "
             "computed from the run itself is reached by construction. ε: the trigger's floor; t_k: "
-            "the k-th event; H = Â + B̂K, or 0 with a hold; β̃: bound of the sensor's error; W: "
+            "the k-th event; H = Â + B̂K, or 0 with a hold; W: "
             "trigger.weight. Sources: (I1) and "
             "certificates, docs/theory.md; eq:... and theorems, the paper",
         )

@@ -93,8 +93,10 @@ def design(
     ] = CertificateConditions.PAPER,
     weights: Annotated[
         str,
-        Option(help="Norms to try: `identity`, `given` in the scenario, or `contracting` along the models."),
-    ] = "identity,contracting",
+        Option(
+            help="Norms to try: `identity`, `given` in the scenario, or `input`: errors by what they do to u."
+        ),
+    ] = "identity,input",
     gain: Annotated[
         DesignGain, Option(help="Gain K: `given` in the scenario, or `lqr` of the nominal model.")
     ] = DesignGain.GIVEN,

@@ -75,9 +75,7 @@ def trigger_document(result: DesignResult) -> Document:
         )
     if bounds:
         texts = ", ".join(certified(name, value) for name, value in bounds.items())
-        blocks.append(
-            Sentence(text=f"certified {result.conditions} (computed): {texts}", role=SentenceRole.REMARK)
-        )
+        blocks.append(Sentence(text=f"certified {result.conditions}: {texts}", role=SentenceRole.REMARK))
     return Document(
         title=result.name,
         kind="design",

@@ -20,7 +20,8 @@ from noack.core.number_format import to_digits
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows
-from noack.theory.response_bounds import lyapunov_decay
+from noack.theory.response_bounds import NotDecayingError
+from noack.theory.trigger_norm import input_norm
 
 RATE_STEP, RATE_STEPS, MOST_RATE = 1.5, 6, 0.95
 """α of the grid: MOST_RATE of the decay rate, divided by powers of RATE_STEP; RATE_STEPS values."""
@@ -136,8 +137,9 @@ def space_of(families: Mapping[tuple[str, str], Scenario]) -> DesignSpace:
     return DesignSpace(normed, rates, initial_norm, floor)
 
 
-NORMS = ("identity", "given", "contracting")
-"""Of the trigger: Euclidean, the scenario's, and one that falls along the models."""
+NORMS = ("identity", "given", "input")
+"""Of the trigger: Euclidean, the scenario's, and one that counts errors by
+what they do to the input."""
 COSTS_OF_INPUT = (0.1, 1.0, 10.0)
 """Factors of R: three regulators, from large to small inputs."""
 
@@ -220,12 +222,14 @@ def _with_norm(scenario: Scenario, norm: str) -> Scenario:
         if scenario.decaying.weight is None:
             raise CallerError("--weights given: the scenario has no trigger.weight")
         return scenario
-    if norm != "contracting":
+    if norm != "input":
         raise CallerError(f'--weights: {", ".join(NORMS)}, not "{norm}"')
     if scenario.mode == "zoh":
-        raise CallerError("--weights contracting: models that hold do not decay; take --weights identity")
+        raise CallerError("--weights input: models that hold do not decay; take --weights identity")
     # α in the middle of the grid: a norm that contracts at this rate does so at all lower rates.
-    form, _ = lyapunov_decay(loop_of(resolve(scenario)).H, MOST_RATE * decay_rate(scenario) / RATE_STEP)
-    weight = np.linalg.cholesky(form).T
-    weight /= np.linalg.det(weight) ** (1 / len(weight))  # ‖W e‖ ≤ β has the volume of ‖e‖ ≤ β
+    loop, rate_per_s = loop_of(resolve(scenario)), MOST_RATE * decay_rate(scenario) / RATE_STEP
+    try:
+        weight = input_norm(loop.H, loop.K, rate_per_s)
+    except NotDecayingError as error:
+        raise CallerError(f"--weights input: {error}") from None
     return with_norm(tuple(map(tuple, weight.tolist())))

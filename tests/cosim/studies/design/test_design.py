@@ -104,13 +104,13 @@ def test_check_and_certify_accept_the_written_scenario(
 def test_a_chosen_norm_is_certified_as_written(scalar_file: Path, tmp_path: Path, run_design: Design) -> None:
     out = tmp_path / "chosen.toml"
     result = run_design(
-        scalar_file, "--settling", "4", "--quantile", "0.7", "--draws", "40", "--weights", "contracting",
+        scalar_file, "--settling", "4", "--quantile", "0.7", "--draws", "40", "--weights", "input",
         "--bound", "error=0.3", "--bound", "state=2",
         "--out", str(out), "--json",
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr
     best = json.loads(result.stdout)["best"]
-    assert best["weight"] == "contracting"
+    assert best["weight"] == "input"
     assert best["W"] == [list(row) for row in load(out).decaying.weight or ()]
     error = sum(paper_certificate(out)["proven"]["bounds"]["e_c"].values())
     assert best["bounds"]["error"] == pytest.approx(error / abs(best["W"][0][0]))
