@@ -210,8 +210,8 @@ class UnitGains:
             for i, size in enumerate(loop.sizes):
                 yield Source(columns_of(loop.pushes, [i]), {"1": size}, {}, {"1": size}, is_outside=True)
         if loop.push_before_input is not None and unit.has_start:  # it acts up to t_a, where f₁ has fallen
-            size = {"1": (arb(loop.times.start) * unit.rate).exp()}
-            yield Source(loop.push_before_input, {}, size, size, is_outside=True)
+            early = {"1": (arb(loop.times.start) * unit.rate).exp()}
+            yield Source(loop.push_before_input, {}, early, early, is_outside=True)
 
     def growth(self, until: arb) -> list[Response]:
         """Return the growth of W e_s within a time, from W⁻¹ and by each source."""

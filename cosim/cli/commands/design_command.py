@@ -93,9 +93,7 @@ def design(
     ] = CertificateConditions.PAPER,
     weights: Annotated[
         str,
-        Option(
-            help="Norms to try: `identity`, `given` in the scenario, or `input`: errors by what they do to u."
-        ),
+        Option(help="Norms to try: `identity`, `given` in the scenario, `input`: by what errors do to u."),
     ] = "identity,input",
     gain: Annotated[
         DesignGain, Option(help="Gain K: `given` in the scenario, or `lqr` of the nominal model.")
