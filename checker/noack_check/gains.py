@@ -241,7 +241,7 @@ class UnitGains:
         # Errors.
         self._scaled_H = H + unit.rate * one
         errors = {"W": loop.weight} | {f"p {j}": rows_of(aged, [j]) for j in range(m)}
-        self._tested: list[Form] = [{"1": unit.noise}]
+        self._tested: list[dict[str, arb]] = [{"1": unit.noise}]
         """The parts of e_s after a test: of W⁻¹, and perhaps of Y⁻¹."""
         starts, is_own = [inverse], is_zero(compared.errors - loop.weight)
         if witness.comparison is not None:
