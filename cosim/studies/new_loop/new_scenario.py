@@ -412,6 +412,7 @@ class _TrialScenarios:
                 "gain": trial.gain.K.tolist(),
                 **({"integral": [*trial.gain.integrals]} if trial.gain.integrals else {}),
                 "state_names": list(reference.state_names),
+                **({"state_units": list(reference.units)} if self._has_own_units else {}),
                 "input_names": list(reference.input_names),
             },
             "plant": {
@@ -438,6 +439,11 @@ class _TrialScenarios:
         for key, value in self._fixed_settings.items():
             put(content, key, value, f"--set {key}")
         return content
+
+    @property
+    def _has_own_units(self) -> bool:
+        """Whether the units of the states are not those of the plant's kind, which a scenario has anyhow."""
+        return any(self._model.plant.units) and not self._model.plant.system.states
 
     def _first_floor(self, trial: _Trial, beta: float) -> float:
         """Return the last threshold that is tried first."""
