@@ -95,6 +95,7 @@ SLOW = (
     'model={name="double_integrator"}',
     f"plant={{initial_state=[1.0,0.0],rate_hz={RATE_HZ}}}",
     f"controller.rate_hz={RATE_HZ}",
+    'outputs=[{name="position"}, {name="velocity"}]',
 )
 """With a step of 45.8 ms, this loop has no certificate for its schedule in the Euclidean norm."""
 
@@ -402,7 +403,9 @@ def test_the_first_screen_is_a_sentence_and_a_few_lines() -> None:
     outputs = 'outputs=[{name="angle", unit="rad", allowed=0.02}, {name="rate", unit="rad/s", allowed=0.005}]'
     cases = {
         "stated outputs": Certificates(resolved("unstable_pendulum", outputs), 2),
-        "the states": Certificates(resolved("unstable_pendulum"), 2),
+        "the states": Certificates(
+            resolved("unstable_pendulum", 'outputs=[{name="angle"}, {name="rate"}]'), 2
+        ),
         "no certificate": Certificates(resolved("lane_following", *SLOW), 2),
     }
     proven = PROVEN._replace(
@@ -428,7 +431,7 @@ def test_what_is_proven_takes_the_place_of_what_is_computed() -> None:
     assert rows["+ without decay: ‖x‖"] == "0.5✓"
     assert rows["Δ, bound of ‖e_c‖/β"] == "2✓"
     assert rows["bound of ‖e_s‖/β"] == "0.5✓"
-    assert rows["bound of |r| in the limit"] == "0.125✓"
+    assert rows["bound of |heading| in the limit"] == "0.125✓"
     assert rows["inter-event time, s"] == "0.004✓"  # also where the computed one is larger
     assert rows["bound of ‖u − Kx‖"] == "3.998"
     t_s = np.array([0.0, 10.0])
