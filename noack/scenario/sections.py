@@ -141,7 +141,6 @@ class ModelSection(ScenarioSection):
         require_distinct(self.state_names, "state_names")
         require_distinct(self.input_names, "input_names")
         self._check_loads(n)
-        self._require_stable()
         if self.integral is not None:  # loading a scenario replaces it
             raise ValueError("integral: it is read where a scenario file is loaded; give a controller here")
         return self
@@ -167,12 +166,16 @@ class ModelSection(ScenarioSection):
             if name not in known:
                 raise ValueError(f"hold: no state is named {name}; they are {', '.join(known)}")
 
-    def _require_stable(self) -> None:
+    def require_stable(self) -> None:
+        """Raise ValueError unless the closed loop Â + B̂K is stable, or may be unstable.
+
+        The message begins with the key. A controller with states of its own replaces this loop by another.
+        """
         (A, B), uses_named_gain = self.matrices, self.gain is None  # a named model's own gain
         K = self.named.K if uses_named_gain else np.array(self.gain)
         n = self.dimensions[0] - self.load_states
         A, B, K = A[:n, :n], B[:n], K[:, :n]  # a constant load does not decay
-        key = "parameters" if uses_named_gain else "gain"
+        key = "model.parameters" if uses_named_gain else "model.gain"
         if not np.isfinite(_closed_loop(A, B, K)).all():
             raise ValueError(f"{key}: A + BK has infinite entries; check the units of A, B and K")
         if not self.allow_unstable and (reason := instability(A, B, K)) is not None:

@@ -137,8 +137,11 @@ def refusals_about_reference(resolved: Scenario, *, knows_inputs: bool = False) 
         }
     x_r, u_r = setpoint
     if u_r.any() and not knows_inputs:
+        start_s = nominal_conditions(resolved, resolved.certificate.late_periods).start_s
         why = (
-            "controller.setpoint: the input is 0 until the first one arrives, and not the set-point's u_r ≠ 0"
+            "controller.setpoint: the input is 0 until the first one arrives, and not the set-point's "
+            "u_r ≠ 0; a [[controller.reference]] that steps there, with a join_s and from_s above "
+            f"{start_s:g}, can be certified"
         )
         return dict.fromkeys((OWN_PLANT, BOX), why)
     half_A, half_B = resolved.plant.uncertainty_A, resolved.plant.uncertainty_B

@@ -298,7 +298,7 @@ def test_a_set_point_is_certified_in_its_own_coordinates() -> None:
     rest = -np.linalg.solve(H_of_plant, loop.A @ x_r)
     persistent = tilted.paper.state(np.array([1e3]))[0]
     assert 0 < np.linalg.norm(rest) < persistent < 30 * np.linalg.norm(rest)
-    with pytest.raises(CallerError, match="the input is 0 until the first one arrives"):
+    with pytest.raises(CallerError, match=r"first one arrives, .* a \[\[controller.reference\]\] that steps"):
         Certificates(resolved("unstable_pendulum", "controller.setpoint=[0.1, 0.0]"), 2)
 
 

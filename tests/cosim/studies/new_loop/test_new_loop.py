@@ -44,6 +44,12 @@ class Weighed:
     def derivative(self, t_s, z, u):
         return z[1], u[0] - 9.81
 
+class Sticking:
+    """Dry friction as a sign; math.copysign is not 0 at 0."""
+
+    def derivative(self, t_s, z, u):
+        return z[1], u[0] - z[1] - math.copysign(0.5, z[1])
+
 class Broken:
     def derivative(self, t_s, z, u):
         return nothing
