@@ -61,7 +61,8 @@ def vector_names(run: ResolvedRun) -> dict[str, Sequence[str]]:
     if len(names) > 1:
         return {}
     ((states, units, inputs),) = names
-    return {"state_names": states, "input_names": inputs} | ({"state_units": units} if units else {})
+    all_names: dict[str, Sequence[str]] = {"state_names": states, "input_names": inputs}
+    return all_names | ({"state_units": units} if units else {})
 
 
 @contextmanager
