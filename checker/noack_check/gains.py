@@ -13,9 +13,16 @@ unit f₁, what is constant of f₂ (and all if f₁ = f₂). Each unit has ineq
 every signal is multiplied by e^{rt}, and H, A + BK, A stand for these matrices plus r. In a unit let θ be
 the part of the threshold, and η that of ‖W n‖, where x + n is what the sensor takes for x.
 
-*After a test* ‖W e_s‖ ≤ b = θ + sup ‖N(x + n)‖ + η, whether it was silent, or an event that set e_s := n.
-The next one is at most h later. With a dwell time h is the time from an event on in which none is tested.
-For a periodic rule, which compares nothing, it is that up to the next event, and b = η.
+*The comparison.* A witness names matrices Y, J and S with Q + SᵀS ⪰ (J, I)ᵀ YᵀY (J, I) on (x, e_s), where an
+event needs zᵀQz > θ². So a silent test leaves c = ‖Y(e_s − n + J(x + n))‖ with c² ≤ θ² + ‖S(x + n)‖². For
+‖W e_s‖² > θ² + ‖Nx‖² these are W, 0 and N. With ‖S(x + n)‖ ≤ s₁f₁ + s₂f₂ and θ ≤ max(θ₁f₁, θ₂f₂) this
+bound is convex in f₁ from 0 to 1. So c ≤ c₁f₁ + c₂f₂ if it is so at both ends: c₂ ≥ √(θ₂² + s₂²) and
+c₁ + c₂ ≥ √(max(θ₁, θ₂)² + (s₁ + s₂)²). In a single unit c ≤ √(θ² + s²).
+
+*After a test* e_s = Y⁻¹y − J(x + n) + n with ‖y‖ ≤ c, or e_s = n if it was an event. So |C e^{Hs} e_s| is
+at most the sum b(s) of the bounds of these three parts. The next test is at most h later. With a dwell time
+h is the time from an event on in which none is tested. For a periodic rule, which compares nothing, it is
+that up to the next event, and e_s = n.
 
 *The controller's error.* Let t_r be the last event whose update acts at t, and v(τ) = e_s(τ) +
 Σ e^{H(τ−t_k)} (e_s(t_k⁻) − n_k) over the events in (t_r, τ]. An event does not change v. So v is continuous,
@@ -23,13 +30,14 @@ v̇ = Hv − (Ex + Bp + ω + Dd), however close the events are, and v(t) = e_c(t
 is t_r, v(σ) = n. Else the events in (t_r, σ] are lost, since they would act in the place of t_r: at most
 M − 1. Go back from σ to the test before it, and from each lost event to the test before it. Then
 
-    |C e_c| ≤ g b + Σ_q ∫₀^{h+d} |C e^{Hs} q| ds · |q̂|
-              + (M − 1) (k (b + η) + Σ_q min(h sup |C e^{Hs} q|, k ∫₀ʰ ‖W e^{Hs} q‖ ds) · |q̂|)
+    |C e_c| ≤ g + Σ_q ∫₀^{h+d} |C e^{Hs} q| ds · |q̂|
+              + (M − 1) (g' + k η + Σ_q min(h sup |C e^{Hs} q|, k ∫₀ʰ ‖W e^{Hs} q‖ ds) · |q̂|)
 
-with g and k the suprema of ‖C e^{Hs} W⁻¹‖ up to h + d, and for ever. The sums are over the columns q of B, D,
-and of the identity for ω and Ex, with the suprema |q̂| of p, d, ω and Ex. So neither times between events
-nor numbers of updates on their way are assumed. With a periodic rule t − t_r ≤ Mh + d: v is followed from
-t_r, and nothing is counted as lost.
+with g and g' the suprema of b(s) up to h + d, and for ever, and k that of ‖C e^{Hs} W⁻¹‖ for ever. The sums
+are over the columns q of B, D, and of the identity for ω and Ex, with the suprema |q̂| of p, d, ω and Ex. The
+integrals are over times that do not overlap, so p before the first input adds at most t_a sup |C e^{Hs} q|
+|q̂|. Neither times between events nor numbers of updates on their way are assumed. With a periodic rule
+t − t_r ≤ Mh + d: v is followed from t_r, and nothing is counted as lost.
 
 *The input* is K e^{−Hs} x_c of an age s ≤ a: p = K e^{−Hs} e_c − ∫₀ˢ K e^{−Hτ} H x dτ. With a ball C around
 K e^{−Hs} for all ages, |p_j| ≤ |C_j e_c| + a |C_j H x|.
@@ -38,20 +46,21 @@ K e^{−Hs} for all ages, |p_j| ≤ |C_j e_c| + a |C_j H x|.
 adds at most t_a sup |C e^{(A+BK)s} q| |q̂|: p = −Kx, of which x = e^{At} x(0) + … gives a bound.
 
 *Conclusion.* For each signal these are inequalities v_i(t) ≤ (T v)(t) + g_i(t) with a positive linear T of
-the past, which maps y₁f₁ + y₂f₂ to at most F₁y₁ f₁ + F₂y₂ f₂. The solution has y > Fy + g in both units.
-Up to a time there are finitely many events (tests are apart; with tests at all times events are, too: see
-:mod:`.sentences`), and all signals are finite. Let λ be the least number with v ≤ λ(y₁f₁ + y₂f₂) up to this
-time. If λ > 1, then v ≤ λ(Ty + g) is at most λ(1 − ε)(y₁f₁ + y₂f₂) for an ε > 0: a contradiction. So
-v ≤ y₁f₁ + y₂f₂, up to any time. Where the plant is enclosed on a region, this holds up to the time at which
-x or u would leave it, and there it shows that they do not: see :mod:`.proof`.
+the past, which maps y₁f₁ + y₂f₂ to at most F₁y₁ f₁ + F₂y₂ f₂. The solution has y > Fy + g in both units, and
+c₁ and c₂ exceed their bounds. Up to a time there are finitely many events (tests are apart; with tests at all
+times events are, too: see :mod:`.sentences`), and all signals are finite. Let λ be the least number with
+v ≤ λ(y₁f₁ + y₂f₂) up to this time. If λ > 1, then v ≤ λ(Ty + g), as also √(θ² + λ²s²) ≤ λ√(θ² + s²), is at
+most λ(1 − ε)(y₁f₁ + y₂f₂) for an ε > 0: a contradiction. So v ≤ y₁f₁ + y₂f₂, up to any time. Where the plant
+is enclosed on a region, this holds up to the time at which x or u would leave it, and there it shows that
+they do not: see :mod:`.proof`.
 """
 
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from flint import arb, arb_mat
 
-from noack_check.balls import columns_of, identity, is_zero, rows_of, upto, zeros
+from noack_check.balls import beside, columns_of, identity, is_positive, is_zero, rows_of, square, upto, zeros
 from noack_check.check import RejectedError
 from noack_check.document import read_matrix, read_number, read_rows, read_table
 from noack_check.loop import Loop
@@ -63,6 +72,8 @@ Form = Mapping[str, arb]
 """Σ coefficient · signal, by the signals' names; "1" is the constant 1."""
 _ROOM = 1e-9
 """By so much, relatively, y exceeds the solution of y = Fy + g."""
+_CHORDS, _BETTER = 8, 0.999
+"""Chords of √(θ² + s²) that are tried, while they are less steep by this factor."""
 
 
 class Unit(NamedTuple):
@@ -75,21 +86,30 @@ class Unit(NamedTuple):
     noise: arb
 
 
+class Comparison(NamedTuple):
+    """After a silent test ‖Y(e_s − n + J(x + n))‖² ≤ θ² + ‖S(x + n)‖²."""
+
+    errors: arb_mat  # Y, (n, n)
+    shift: arb_mat  # J, (n, n)
+    share: arb_mat  # S, (k, n)
+
+
 class Witness(NamedTuple):
-    """What a witness names: Lyapunov functions at the rate r, and T."""
+    """What a witness names: Lyapunov functions at the rate r, T, and what a silent test says."""
 
     plant: Decay  # of A + BK + r
     model: Decay | None  # of H + r; None: the models hold the last update, or nothing is lost
     inputs: arb_mat
+    comparison: Comparison | None  # None: a periodic rule compares nothing
 
 
 class Source(NamedTuple):
     """A column through which something acts, and the sup of its amplitude in the equation of x and of e_s."""
 
     column: arb_mat
-    lasting: Form  # in that of x
-    early: Form  # in that of x, up to the first input
+    of_state: Form
     of_error: Form
+    early: Form  # in both, up to the first input
     is_outside: bool = False  # acts before the first input, too, beside p
 
 
@@ -114,21 +134,47 @@ def read_witness(loop: Loop, table: Mapping[str, object]) -> Witness:
     T = read_rows(table, "inputs")
     if (T.nrows(), T.ncols()) != (loop.B.ncols(),) * 2:
         raise RejectedError("gains: inputs: not a square matrix of the right size")
-    return Witness(decays["plant"], decays.get("model"), T)
+    return Witness(decays["plant"], decays.get("model"), T, _comparison(loop, table))
 
 
 def require_covered(loop: Loop) -> None:
     """Raise RejectedError if the argument does not cover a loop: its rule, or unknown loads."""
-    n, rule = loop.n, loop.rule
+    rule = loop.rule
     if loop.loads or rule.memory is not None or rule.of_input:
         raise RejectedError("gains: not with loads, nor a rule with a memory or of the input")
-    if loop.times.period > 0:
-        return
+
+
+def own_comparison(loop: Loop) -> Comparison | None:
+    """Return what a silent test says if the rule compares ‖W e_s‖ with a threshold, and with x; else None."""
+    n, rule = loop.n, loop.rule
     states, errors = range(n), range(n, 2 * n)
     compares = rule.positive.nrows() == n and is_zero(columns_of(rule.positive, states))
     compares = compares and is_zero(columns_of(rule.positive, errors) - loop.weight)
     if not compares or (rule.negative.nrows() and not is_zero(columns_of(rule.negative, errors))):
-        raise RejectedError("gains: the rule does not compare ‖W e_s‖ with a threshold, or with x")
+        return None
+    share = columns_of(rule.negative, states) if rule.negative.nrows() else zeros(0, n)
+    return Comparison(loop.weight, zeros(n, n), share)
+
+
+def _comparison(loop: Loop, table: Mapping[str, object]) -> Comparison | None:
+    """Return what a silent test says, as proven: of some rules with what a document's table names."""
+    n, rule = loop.n, loop.rule
+    if loop.times.period > 0:
+        return None
+    if (own := own_comparison(loop)) is not None:
+        return own
+    if "comparison" not in table:
+        raise RejectedError("gains: the rule does not compare ‖W e_s‖: a comparison is needed")
+    entry = read_table(table, "comparison")
+    found = Comparison(*(read_rows(entry, name) for name in Comparison._fields))
+    shapes = [(M.nrows(), M.ncols()) for M in found]
+    if shapes[:2] != [(n, n)] * 2 or shapes[2][1] != n:
+        raise RejectedError("gains: comparison: matrices of another size")
+    Q = square(rule.positive) - square(rule.negative) if rule.negative.nrows() else square(rule.positive)
+    Q += square(beside(found.share, zeros(found.share.nrows(), n)))
+    if not is_positive(Q - square(found.errors * beside(found.shift, identity(n)))):
+        raise RejectedError("gains: comparison: a silent test does not say as much")
+    return found
 
 
 class UnitGains:
@@ -139,18 +185,29 @@ class UnitGains:
         unit: the unit.
         witness: what the document names.
         wanted: the outputs to bound.
+        constant: the inequalities in the unit f₂, for those in f₁, if there are both.
 
     Raises:
         RejectedError: a response is not enclosed, or a signal has no bound.
     """
 
-    def __init__(self, loop: Loop, unit: Unit, witness: Witness, wanted: Container[str]) -> None:
-        self.loop, self.unit = loop, unit
-        n, m, times, rule, one = loop.n, loop.B.ncols(), loop.times, loop.rule, identity(loop.n)
+    def __init__(
+        self,
+        loop: Loop,
+        unit: Unit,
+        witness: Witness,
+        wanted: Container[str],
+        constant: "UnitGains | None" = None,
+    ) -> None:
+        self.loop, self.unit, self._constant = loop, unit, constant
+        n, m, times, one = loop.n, loop.B.ncols(), loop.times, identity(loop.n)
+        compared = witness.comparison or Comparison(loop.weight, zeros(n, n), zeros(0, n))
         try:
-            self._inputs, inverse = witness.inputs.inv(), loop.weight.inv()
+            self._inputs, inverse, of_compared = (
+                M.inv() for M in (witness.inputs, loop.weight, compared.errors)
+            )
         except ZeroDivisionError:
-            raise RejectedError("gains: weight or inputs: not proven to have an inverse") from None
+            raise RejectedError("gains: weight, inputs or errors: not proven to have an inverse") from None
         K, H, self._closed = witness.inputs * loop.gain, loop.H, loop.A + loop.B * loop.gain
         self._early, is_periodic = arb(times.start), times.period > 0
         self._untested = arb(times.period if is_periodic else max(times.sampling, times.dwell))
@@ -164,10 +221,10 @@ class UnitGains:
 
         # The state.
         aged = K * (-1 * upto(arb(times.age)) * H).exp()
-        share = columns_of(rule.negative, range(n)) if rule.negative.nrows() else zeros(0, n)
+        share, shift = compared.share, loop.weight * compared.shift
         entries = {f"x[{i}]": rows_of(one, [i]) for i in range(n)}
         entries |= {f"y[{i}]": rows_of(loop.output_rows, [i]) for i in range(loop.output_rows.nrows())}
-        outputs = {"x": one, "share": share}
+        outputs = {"x": one, "share": share, "shift": shift}
         outputs |= {
             name: row for name, row in entries.items() if name in wanted or (self._boxed and name[0] == "x")
         }
@@ -184,34 +241,45 @@ class UnitGains:
         # Errors.
         self._scaled_H = H + unit.rate * one
         errors = {"W": loop.weight} | {f"p {j}": rows_of(aged, [j]) for j in range(m)}
-        self._columns = [inverse, *(source.column for source in self._sources)]
+        self._tested: list[dict[str, arb]] = [{"1": unit.noise}]
+        """The parts of e_s after a test: of W⁻¹, and perhaps of Y⁻¹."""
+        starts, is_own = [inverse], is_zero(compared.errors - loop.weight)
+        if witness.comparison is not None:
+            self._tested[0] |= {"shift": arb(1)}
+            if is_own:
+                self._tested[0] |= {"compared": arb(1)}
+            else:
+                self._tested.append({"compared": arb(1)})
+                starts.append(of_compared)
+        self._columns = [*starts, *(source.column for source in self._sources)]
         found = responses_until(self._scaled_H, recent, list(errors.values()), self._columns)
         self._recent = dict(zip(errors, found, strict=True))
         self._untested_growth = self.growth(self._untested)
         self._ever = {}
         if self._lost:
             self._ever = dict(zip(errors, self._for_ever(list(errors.values()), witness.model), strict=True))
-        self._tested = {"1": unit.noise + (arb(0) if is_periodic else unit.threshold)}
-        self._tested |= {"share": arb(1)} if share.nrows() else {}
-        self._share_of_noise = norm_of(share * inverse) * unit.noise
+        self._of_noise = {
+            name: norm_of(M * inverse) * unit.noise for name, M in (("share", share), ("shift", shift))
+        }
         self.sups = self._solution()
 
     def _all_sources(self) -> Iterator[Source]:
         loop, unit, one = self.loop, self.unit, arb(1)
         n, B = loop.n, loop.B * self._inputs
         for j in range(B.ncols()):
-            yield Source(columns_of(B, [j]), {f"p {j}": one}, {f"p before {j}": one}, {f"p ever {j}": one})
+            amplitude = {f"p {j}": one}
+            yield Source(columns_of(B, [j]), amplitude, amplitude, {f"p before {j}": one})
         for i in self._boxed:
             amplitude = {f"box {i}": one}
-            yield Source(columns_of(identity(n), [i]), amplitude, {}, amplitude, is_outside=True)
+            yield Source(columns_of(identity(n), [i]), amplitude, amplitude, {}, is_outside=True)
         for i in self._mismatched:
-            yield Source(columns_of(identity(n), [i]), {}, {}, {f"Ex {i}": one})
+            yield Source(columns_of(identity(n), [i]), {}, {f"Ex {i}": one}, {})
         if unit.has_constants:
             for i, size in enumerate(loop.sizes):
-                yield Source(columns_of(loop.pushes, [i]), {"1": size}, {}, {"1": size}, is_outside=True)
+                yield Source(columns_of(loop.pushes, [i]), {"1": size}, {"1": size}, {}, is_outside=True)
         if loop.push_before_input is not None and unit.has_start:  # it acts up to t_a, where f₁ has fallen
             early = {"1": (arb(loop.times.start) * unit.rate).exp()}
-            yield Source(loop.push_before_input, {}, early, early, is_outside=True)
+            yield Source(loop.push_before_input, {}, {}, early, is_outside=True)
 
     def growth(self, until: arb) -> list[Response]:
         """Return the growth of W e_s within a time, from W⁻¹ and by each source."""
@@ -231,7 +299,7 @@ class UnitGains:
         if self.unit.has_start:
             terms.append((found[-1].most, {"1": arb(1)}))
         for response, source in zip(found, self._sources, strict=False):
-            terms.append((response.total, source.lasting))
+            terms.append((response.total, source.of_state))
             terms.append((response.total.min(self._early * response.most), source.early))
         return _sum(*terms)
 
@@ -243,51 +311,92 @@ class UnitGains:
     def sensor_error(self) -> Form:
         """Return the bound of ‖W e_s‖."""
         grown = self._untested_growth
-        return _sum((grown[0].most, self._tested), *self.driven(each.total for each in grown[1:]))
+        return _sum(*self._after_test(grown), *self.driven(self.of_sources(grown)))
 
     def error(self, name: str) -> Form:
         """Return the bound of an output |C e_c|: "W", or "p j" for the row j of K e^{−Hs}."""
         recent = self._recent[name]
-        terms = [(recent[0].most, self._tested), *self.driven(each.total for each in recent[1:])]
+        terms, sources = self._after_test(recent), self.of_sources(recent)
         if self._lost:
-            gain, *ever = (each.most for each in self._ever[name])
-            terms += [(self._lost * gain, self._tested), (self._lost * gain, {"1": self.unit.noise})]
-            grown = [each.total for each in self._untested_growth[1:]]
-            pairs = zip(ever, grown, strict=True)
-            terms += self.driven(
-                self._lost * (self._untested * most).min(gain * total) for most, total in pairs
-            )
-        return _sum(*terms)
+            ever, gain = self._ever[name], self._ever[name][0].most
+            terms += [(self._lost * most, form) for most, form in self._after_test(ever)]
+            terms.append((self._lost * gain, {"1": self.unit.noise}))
+            growths = zip(sources, self.of_sources(ever), self.of_sources(self._untested_growth), strict=True)
+            sources = [
+                Response(
+                    of_ever.most,
+                    of_recent.total + self._lost * (self._untested * of_ever.most).min(gain * untested.total),
+                )
+                for of_recent, of_ever, untested in growths
+            ]
+        return _sum(*terms, *self.driven(sources))
 
-    def driven(self, totals: Iterable[arb]) -> list[tuple[arb, Form]]:
-        """Return terms of an error, by what it is driven by each source."""
-        return [(total, source.of_error) for total, source in zip(totals, self._sources, strict=True)]
+    def _after_test(self, growths: Sequence[Response]) -> list[tuple[arb, Form]]:
+        """Return terms of an error, by what a test leaves."""
+        return [(growth.most, form) for growth, form in zip(growths, self._tested, strict=False)]
 
-    def _inequalities(self) -> Iterator[tuple[str, Form]]:
-        """Yield signals and what they are at most; of a signal with several, the largest."""
+    def of_sources(self, growths: Sequence[Response]) -> Sequence[Response]:
+        """Return the responses to the sources."""
+        return growths[len(self._tested) :]
+
+    def driven(self, growths: Sequence[Response]) -> Iterator[tuple[arb, Form]]:
+        """Yield terms of an error, by what it is driven by each source."""
+        for growth, source in zip(growths, self._sources, strict=True):
+            yield growth.total, source.of_error
+            yield growth.total.min(self._early * growth.most), source.early
+
+    def _inequalities(self, slope: arb) -> Iterator[tuple[str, Form]]:
+        """Yield signals and what they are at most; of a signal with several, the largest.
+
+        ``slope`` is that of a chord of √(θ² + s²).
+        """
         loop, one = self.loop, arb(1)
         for j in range(loop.B.ncols()):
             aged = [(arb(loop.times.age), self.state(f"aged {j}"))] if loop.times.age > 0 else []
             yield f"p {j}", _sum((one, self.error(f"p {j}")), *aged)
             before = self._before[j]
             pairs = list(zip(before, self._sources, strict=False))
-            terms = [(response.total, source.of_error) for response, source in pairs if source.is_outside]
+            outside = [(response.total, source) for response, source in pairs if source.is_outside]
+            terms = [(total, form) for total, source in outside for form in (source.of_error, source.early)]
             terms += [(before[-1].most, {"1": one})] if self.unit.has_start else []
             yield f"p before {j}", _sum(*terms)
-            yield f"p ever {j}", {f"p {j}": one}
-            if self._early > 0:
-                yield f"p ever {j}", {f"p before {j}": one}
         for i in self._boxed:
             terms = [(loop.half_A[i, j], self.state(f"x[{j}]")) for j in range(loop.n)]
             terms += [(loop.half_B[i, j], self.input(j)) for j in range(loop.B.ncols())]
             yield f"box {i}", _sum(*terms)
         for i in self._mismatched:
             yield f"Ex {i}", self.state(f"Ex {i}")
-        yield "share", _sum((one, self.state("share")), (self._share_of_noise, {"1": one}))
+        for name, of_noise in self._of_noise.items():
+            yield name, _sum((one, self.state(name)), (of_noise, {"1": one}))
+        yield "compared", {"1": self._compared(arb(0)), "share": slope}
+
+    def _compared(self, share: arb) -> arb:
+        """Return a bound of c in this unit, if ‖S(x + n)‖ is at most a share in this unit."""
+        if self._constant is None:
+            return upper((self.unit.threshold**2 + share**2).sqrt())
+        sups, threshold = self._constant.sups, self.unit.threshold.max(self._constant.unit.threshold)
+        both = (threshold**2 + (share + sups["share"]) ** 2).sqrt()
+        return upper((both - sups["compared"]).max(arb(0)))
 
     def _solution(self) -> dict[str, arb]:
+        """Return y > Fy + g, by signals, with chords of the bound of c up to smaller and smaller shares."""
+        slope, none = arb(1), self._compared(arb(0))
+        y = self._solution_at(slope)
+        for _ in range(_CHORDS):
+            following = upper((self._compared(y["share"]) - none) / y["share"])
+            if not following < _BETTER * slope:
+                break
+            smaller = self._solution_at(following)
+            if not self._compared(smaller["share"]) < smaller["compared"]:
+                break
+            y, slope = smaller, following
+        if not self._compared(y["share"]) < y["compared"]:
+            raise RejectedError("gains: the comparison has no bound by them")
+        return y
+
+    def _solution_at(self, slope: arb) -> dict[str, arb]:
         """Return y > Fy + g, by signals. Which inequality counts of several is tried."""
-        every = list(self._inequalities())
+        every = list(self._inequalities(slope))
         chosen = dict(reversed(every))
         for _ in range(len(chosen)):
             y = _solved(chosen)
@@ -358,7 +467,9 @@ class Gains:
         outputs = table.get("outputs")
         if not isinstance(outputs, list) or not {"x", "e_s", "e_c"} | entries >= {*map(str, outputs)}:
             raise RejectedError("gains: outputs: not a list of the loop's")
-        self._units = [UnitGains(loop, unit, witness, outputs) for unit in units_of(loop, rate)]
+        self._units: list[UnitGains] = []
+        for unit in reversed(units_of(loop, rate)):
+            self._units.append(UnitGains(loop, unit, witness, outputs, *self._units))
         self.bounds = {str(output): self._bound(str(output)) for output in outputs}
         """D₁ and D₂ of each output that the document names."""
 
@@ -380,6 +491,6 @@ class Gains:
         found = {True: arb(0), False: arb(0)}
         for gains in self._units:
             grown = gains.growth(time)
-            form = _sum(*gains.driven(each.total for each in grown[1:]))
+            form = _sum(*gains.driven(gains.of_sources(grown)))
             found[gains.unit.has_constants] = value(form, gains.sups) + (grown[0].most + 1) * gains.unit.noise
         return found[False], found[True]

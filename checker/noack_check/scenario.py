@@ -106,7 +106,7 @@ def read_loop(
         noise=_noise(resolved, n),
         observer=_observer(resolved, plants, ideal=ideal),
         outputs=_outputs(resolved, n),
-        losses=most_losses(resolved),
+        losses=most_losses(_table(resolved, "network")),
         times=times,
         **_start(resolved, plants),
     )
@@ -359,16 +359,13 @@ def output_names(resolved: Table) -> list[str]:
     return names
 
 
-def most_losses(resolved: Table) -> int:
-    """Return the most consecutive losses that the guarantee allows."""
-    network = _table(resolved, "network")
-    most = _whole(network, "network.mansd")
-    for entry in _tables(network, "network.constraints"):
-        if entry.get("kind") == "at_most":
-            limit, window = _window(entry)
-            if limit < window:
-                most = min(most, limit)
-    return most
+def most_losses(network: Table, name: str = "network") -> int:
+    """Return the most consecutive losses that the guarantee of a direction of the network allows."""
+    windows = [_window(e) for e in _tables(network, f"{name}.constraints") if e.get("kind") == "at_most"]
+    limits = [limit for limit, window in windows if limit < window]
+    if "mansd" in network or not limits:
+        limits.append(_whole(network, f"{name}.mansd"))
+    return min(limits)
 
 
 def _window(constraint: Table) -> tuple[int, int]:
@@ -389,7 +386,7 @@ def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
         if due[1]:
             (first, _), (_, last) = (schedule.between_events(ns) for ns in due)
             times = times._replace(least_period=first, period=last)
-        _require_watchdog(_optional_table(plant, "watchdog"), times)
+        _require_watchdog(_optional_table(plant, "watchdog"), schedule)
         _require_stated_delay(resolved)
     if due[1]:
         return times
@@ -481,6 +478,13 @@ def _due_ns(trigger: Table) -> tuple[int, int]:
 def read_schedule(resolved: Table) -> Schedule:
     """Return the schedule of a resolved scenario."""
     plant, controller, certificate = (_table(resolved, key) for key in ("plant", "controller", "certificate"))
+    name = "controller.predictions"
+    inputs = (0, Fraction(0), _whole(controller, name) if "predictions" in controller else 1)
+    if inputs[2] < 1:
+        raise RefusedError(f"{name}: below 1")
+    if "actuation" in (network := _table(resolved, "network")):
+        direction, name = _table(network, "actuation"), "network.actuation"
+        inputs = (most_losses(direction, name), _constant_delay_ns(direction, name), inputs[2])
     return Schedule(
         _rate(plant, "plant.rate_hz"),
         max(_whole(plant, "plant.measure_every"), 1),
@@ -488,6 +492,7 @@ def read_schedule(resolved: Table) -> Schedule:
         _real(controller, "controller.phase"),
         _whole(certificate, "certificate.late_periods"),
         _real(certificate, "certificate.network_delay_s") if "network_delay_s" in certificate else 0.0,
+        *inputs,
     )
 
 
@@ -507,16 +512,22 @@ def constant_delay_ns(resolved: Table) -> Fraction:
 
     In a loop whose periods are whole nanoseconds it is one, too.
     """
-    total = Fraction(0)
-    for entry in _tables(_table(resolved, "network"), "network.impairments"):
-        kind = entry.get("kind")
-        if kind == "delay" and not (entry.get("jitter_s") or entry.get("samples_s") or entry.get("file")):
-            delay_s = _real(entry, "network.impairments.delay_s")
-            total += fraction(delay_s) * NS_PER_S if delay_s else 0
-        elif kind not in _WITHOUT_DELAY:
-            raise RefusedError(f"network.impairments: {kind}: the delay of updates is not constant")
+    total = _constant_delay_ns(_table(resolved, "network"), "network")
     if total.denominator > 1 and read_schedule(resolved).is_whole:
         raise RefusedError("network.impairments.delay_s: not a whole number of nanoseconds")
+    return total
+
+
+def _constant_delay_ns(direction: Table, name: str) -> Fraction:
+    """Return the delay in a direction of the network; raise RefusedError if it may vary."""
+    total = Fraction(0)
+    for entry in _tables(direction, f"{name}.impairments"):
+        kind = entry.get("kind")
+        if kind == "delay" and not (entry.get("jitter_s") or entry.get("samples_s") or entry.get("file")):
+            delay_s = _real(entry, f"{name}.impairments.delay_s")
+            total += fraction(delay_s) * NS_PER_S if delay_s else 0
+        elif kind not in _WITHOUT_DELAY:
+            raise RefusedError(f"{name}.impairments: {kind}: the delay is not constant")
     return total
 
 
@@ -584,6 +595,8 @@ def read_linear_loop(resolved: Table) -> Loop:
         RefusedError: a key is not covered, is missing or has a wrong value, or something disturbs the loop.
     """
     controller, plant = _table(resolved, "controller"), _table(resolved, "plant")
+    if "actuation" in _table(resolved, "network") or controller.get("predictions", 1) != 1:
+        raise RefusedError("network.actuation: the growth is of a loop whose inputs do not cross the network")
     without_rest = {key: value for key, value in controller.items() if key not in _OF_REST}
     any_rule = {"policy": "periodic", "period_s": 1.0}
     on_time = {**_table(resolved, "certificate"), "late_periods": 0, "network_delay_s": 0.0}
@@ -591,19 +604,24 @@ def read_linear_loop(resolved: Table) -> Loop:
     loop = read_loop(resolved, box=False, ideal=True)
     if loop.observer is not None or loop.noise.ncols() or loop.sizes:
         raise RefusedError("the growth is of a loop without observer, noise and disturbances")
-    _require_watchdog(_optional_table(plant, "watchdog"), read_schedule(resolved).times)
+    _require_watchdog(_optional_table(plant, "watchdog"), read_schedule(resolved))
     return loop
 
 
-def _require_watchdog(watchdog: Table, times: Times) -> None:
-    """Require that the plant's watchdog does not replace inputs as old as they may be."""
-    if watchdog.get("policy", "hold") == "hold":
+def _require_watchdog(watchdog: Table, schedule: Schedule) -> None:
+    """Require that the plant's watchdog does not replace inputs as old as they may be.
+
+    With the policy "hold" it applies the last one of the newest tick, which may have to wait for its time.
+    """
+    holds = watchdog.get("policy", "hold") == "hold"
+    if holds and not schedule.last_input > 0:
         return
     timeout_s = _real(watchdog, "plant.watchdog.timeout_s")
-    if fmpq(nanoseconds(timeout_s), NS_PER_S) < times.age:
+    oldest = schedule.last_input if holds else schedule.oldest_input
+    if fmpq(nanoseconds(timeout_s), NS_PER_S) < oldest:
         raise RefusedError(
             f"plant.watchdog.timeout_s = {timeout_s:g}: the watchdog may replace an input, "
-            f"which may be {float(times.age.p) / float(times.age.q):g} s old"
+            f"which may be {float(oldest.p) / float(oldest.q):g} s old"
         )
 
 

@@ -10,6 +10,7 @@ from noack_check.equations import formulas
 from noack_check.growth import Growth
 from noack_check.loop import Loop
 from noack_check.proof import Bound, Proof
+from noack_check.scenario import most_losses
 
 _SHORT = 7
 """Longest decimal number that is printed as it is, if it stands for exactly that number."""
@@ -23,6 +24,8 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
     network = scenario.get("network")
     enforced = not isinstance(network, Mapping) or network.get("enforce_mansd", True)
     parts = [f"at most {loop.losses} consecutive losses{'' if enforced else ', which nothing enforces'}"]
+    if isinstance(network, Mapping) and isinstance(direction := network.get("actuation"), Mapping):
+        parts.append(f"at most {most_losses(direction, 'network.actuation')} of inputs")
     if times.sampling > 0:
         ms = {name: f"{float(1000 * arb(getattr(times, name)).mid()):.6g} ms" for name in times._fields}
         parts += [

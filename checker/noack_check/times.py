@@ -5,6 +5,11 @@ multiples of theirs from the phase on. At equal times a step comes before arriva
 effect at the first step with the input of a tick at or after its arrival. This input acts until the
 step after the last one that has it. Up to L steps, and the network's delay, may be added to this.
 
+Where inputs cross the network, the plant uses those of the newest tick of which they have arrived. The next
+ones that arrive are at most a *gap* later than without losses and delays: as many periods of the ticks as
+inputs may be lost one after the other, and their delay. A tick sends inputs for its own time and for some of
+the following ticks; the plant applies the last one whose time has come.
+
 noack's times are whole nanoseconds: if a period is none, step k is at the nearest one to kT, so that
 times between steps differ by 1 ns, and their order may, too.
 """
@@ -63,6 +68,9 @@ class Schedule:
         phase: of the ticks, in their periods.
         late_periods: L, steps by which updates and inputs may be late.
         network_delay_s: largest delay of an update in the network.
+        lost_inputs: of so many successive ticks all inputs may be lost in the network.
+        input_delay_ns: the delay of inputs in the network.
+        predictions: of so many ticks, its own one and those after it, a tick sends the inputs.
     """
 
     def __init__(
@@ -73,12 +81,19 @@ class Schedule:
         phase: float,
         late_periods: int,
         network_delay_s: float,
+        lost_inputs: int = 0,
+        input_delay_ns: Fraction = Fraction(0),
+        predictions: int = 1,
     ) -> None:
         self.step, self.tick = period_ns(rate_hz), period_ns(tick_hz)
         self.sample = self.step * measure_every
         self.is_whole = self.step.denominator == self.tick.denominator == 1
         self._rounded = 0 if self.is_whole else _ROUNDED_NS
         self._late = late_periods * ceil(self.step)
+        self._gap = lost_inputs * ceil(self.tick) + ceil(input_delay_ns)
+        self._predicted = floor(predictions * self.tick) - self.tick
+        self.last_input = fmpq((predictions - 1) * ceil(self.tick), NS_PER_S)
+        """So long after a tick its last input is due, in s."""
         self._phase = fraction(phase) * self.tick if phase else Fraction(0)
         if self.tick.denominator == 1:
             self.phase = round(phase * int(self.tick))
@@ -99,9 +114,11 @@ class Schedule:
         """The times that the statements need."""
         longest = ceil(self.sample)
         shortest = longest if self.is_whole else floor(self.sample)
-        delay, first = self._next_step(self._wait()), self._next_step(self.phase)
+        delay, first = (self._next_step(t + self._gap) for t in (self._wait(), self.phase))
         start = max(first + self._late, delay) if self._in_flight else first
-        age = self._oldest_tick() + ceil(self.step) + self._late
+        oldest = self._oldest_tick()
+        age = ceil(max(min(oldest, self.tick + self._rounded), oldest - self._predicted))
+        age += ceil(self.step) + self._late
         return Times(*(fmpq(t, NS_PER_S) for t in (longest, shortest, delay, age, start)))
 
     def between_events(self, due_ns: int) -> tuple[fmpq, fmpq]:
@@ -119,10 +136,16 @@ class Schedule:
             found.add(_rounded(later * T) - start)
         return fmpq(min(found), NS_PER_S), fmpq(max(found), NS_PER_S)
 
-    def _oldest_tick(self) -> int:
-        """Return the largest age of the newest tick at a step; what it lacks of a tick's period is kept."""
-        newest = self.tick - self.phase % _common(self.step, self.tick) + self._rounded
-        return ceil(newest + self.tick - floor(self.tick))
+    @property
+    def oldest_input(self) -> fmpq:
+        """The largest age that the newest tick of which inputs have arrived may have, in s, until a step."""
+        return fmpq(ceil(self._oldest_tick()) + ceil(self.step) + self._late, NS_PER_S)
+
+    def _oldest_tick(self) -> Fraction:
+        """Return the largest age of the newest tick of which inputs have arrived at a step."""
+        if self._gap % self.tick:  # they may just have missed a step
+            return self._gap + self.tick + self._rounded
+        return self._gap + self.tick - self.phase % _common(self.step, self.tick) + self._rounded
 
     def _wait(self) -> Fraction:
         """Return the longest time from an event to the tick that uses its update."""

@@ -146,8 +146,8 @@ class Run:
             The table with the columns of ``docs/record.md``: times in nanoseconds of simulated
             time, and one column per entry of a vector (``x_1``, ``x_2``, …). The first column is
             ``t_s``, the time ``t_ns`` in seconds; the tables of plant, sensor and controller have
-            the number of the ``loop``. Of a loop of ``loops``, the rows of this loop. Of one loop,
-            ``plant_step`` ends with the outputs that the scenario states, by their names.
+            the number of the ``loop``. Of a loop of ``loops``, the rows of this loop. Of one loop, a
+            table with x ends with the states and the scenario's outputs, by their names.
 
         Raises:
             NoackError: there is no such table, or its file is damaged.
@@ -168,8 +168,8 @@ class Run:
 
         Returns:
             ``t_s`` and ``t_ns``; x, x_s and x_c, one column per state (``x_1``, ``x_s_1``,
-            ``x_c_1``, …); each output that the scenario states, by its name; ``e_s_norm`` before a
-            reset, its ``threshold``, and ``e_c_norm``, all in the trigger's
+            ``x_c_1``, …); x once more by the names of the states, and the scenario's outputs by
+            theirs; ``e_s_norm`` before a reset, its ``threshold``, and ``e_c_norm``, all in the trigger's
             norm; ``event``, the number of the transmitted update, or −1. x_s is the
             value after a reset. x_c is NaN at times without controller records. x is the state that
             the sensor uses; with noise or an observer it differs from the plant's state.

@@ -93,7 +93,7 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
     claims = [claim for claim in loop.claims if claim.until_s is None]  # they hold to the end of the run
     held = [claim for claim in claims if claim.output and claim.verdict == "held"]
     guaranteed = {claim.output: claim.what for claim in held if " stays within " in claim.what}
-    texts, is_good = [], True
+    texts, is_good = [], not _grew(loop)
     for output in loop.outputs:
         if output.allowed is None:
             continue
@@ -109,9 +109,19 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
         is_good = is_good and output.settled_s is not None
     if not texts:
         texts = [f"{output.name} was at most {_with_unit(output.largest, output)}" for output in loop.outputs]
-    lost = loop.longest_loss_burst
-    losses = f", although up to {counted(lost, 'consecutive packet')} {'was' if lost == 1 else 'were'} lost"
-    return _line(f"{' and '.join(texts)}{losses if lost else ''}", Tone.GOOD if is_good else Tone.DOUBTFUL)
+    packets = counted(loop.longest_loss_burst, "consecutive packet")
+    losses = f", although up to {packets} {'was' if loop.longest_loss_burst == 1 else 'were'} lost"
+    if not is_good:
+        losses = f", with up to {packets} lost"
+    text = f"{' and '.join(texts)}{losses if loop.longest_loss_burst else ''}"
+    return _line(text, Tone.GOOD if is_good else Tone.DOUBTFUL)
+
+
+def _grew(loop: LoopSummary) -> bool:
+    """Return whether ‖x‖ diverged, or was much larger at the end than at the start."""
+    first, final = loop.initial_state_norm, loop.final_state_norm
+    grew = first is not None and final is not None and final > _MOST_GROWTH * first > 0
+    return loop.diverged_at_s is not None or grew
 
 
 def _with_unit(value: float | None, output: OutputPart) -> str:

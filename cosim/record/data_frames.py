@@ -30,16 +30,22 @@ def with_seconds(table: pa.Table) -> pa.Table:
 
 @np.errstate(all="ignore")  # a run may diverge
 def with_outputs(table: pa.Table, scenario: Scenario) -> pa.Table:
-    """Add each output that a scenario states to a table with the plant's x, by the output's name."""
-    outputs = scenario.loop_outputs() if scenario.outputs else ()
-    names = entry_names("x", len(outputs[0].row)) if outputs else ()
-    if names and set(names) <= set(table.column_names):
-        columns = [table[name].to_numpy() for name in names]
-        for output in outputs:
-            if output.name not in table.column_names:
-                values = np.column_stack(columns) @ np.array(output.row)
-                table = table.append_column(output.name, pa.array(values))
+    """Add the states and the scenario's outputs to a table with x, by their names."""
+    names = entry_names("x", scenario.model.dimensions[0])
+    if set(names) <= set(table.column_names):
+        x = np.column_stack([table[name].to_numpy() for name in names])
+        for name, values in _by_name(x, scenario).items():
+            if name not in table.column_names:
+                table = table.append_column(name, pa.array(values))
     return table
+
+
+def _by_name(x: NDArray[np.float64], scenario: Scenario) -> dict[str, NDArray[np.float64]]:
+    """Return the states and the stated outputs, (k,) each, by their names."""
+    states, _ = scenario.entry_names
+    stated = scenario.loop_outputs() if scenario.outputs else ()
+    by_name = dict(zip(states, x.T, strict=True))
+    return by_name | {output.name: x @ np.array(output.row) for output in stated}
 
 
 @np.errstate(all="ignore")  # a run may diverge
@@ -49,8 +55,7 @@ def samples(record: RunRecord) -> pa.Table:
     columns: dict[str, NDArray[np.generic]] = {"t_s": _seconds(aligned.t_ns), "t_ns": aligned.t_ns}
     for name, states in (("x", aligned.x), ("x_s", aligned.x_s), ("x_c", aligned.x_c)):
         columns |= dict(zip(entry_names(name, states.shape[1]), states.T, strict=True))
-    for output in record.scenario.loop_outputs() if record.scenario.outputs else ():
-        columns.setdefault(output.name, aligned.x @ np.array(output.row))
+    columns |= {n: v for n, v in _by_name(aligned.x, record.scenario).items() if n not in columns}
     columns |= {
         "e_s_norm": aligned.e_s_norm,
         "threshold": aligned.threshold,

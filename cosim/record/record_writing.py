@@ -55,13 +55,14 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
 
 
 def vector_names(run: ResolvedRun) -> dict[str, Sequence[str]]:
-    """Return the names of states and inputs, if they are the same in all loops."""
+    """Return the names and known units of states, and names of inputs, if all loops have the same."""
     models = [entry.scenario.model for entry in run.entries]
-    names = {(model.state_names or (), model.input_names or ()) for model in models}
+    names = {(model.state_names or (), model.state_units or (), model.input_names or ()) for model in models}
     if len(names) > 1:
         return {}
-    ((states, inputs),) = names
-    return {"state_names": states, "input_names": inputs}
+    ((states, units, inputs),) = names
+    all_names: dict[str, Sequence[str]] = {"state_names": states, "input_names": inputs}
+    return all_names | ({"state_units": units} if units else {})
 
 
 @contextmanager

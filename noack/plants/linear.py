@@ -49,6 +49,7 @@ class NamedModel(NamedTuple):
     K: Matrix
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
+    state_units: tuple[str, ...] | None = None
 
 
 def lane_following(
@@ -77,7 +78,8 @@ def lane_following(
     )
     B = np.array([[b1, 0.0], [0.0, b2], [0.0, 0.0], [0.0, 0.0]])
     row = [0.0, 0.0, -gain, gain / look_ahead]
-    return NamedModel(A, B, np.array([row, row]), ("V", "r", "psi", "Y_g"), ("u_1", "u_2"))
+    names, units = ("V", "r", "psi", "Y_g"), ("m/s", "rad/s", "rad", "m")
+    return NamedModel(A, B, np.array([row, row]), names, ("u_1", "u_2"), units)
 
 
 def double_integrator(*, stiffness: float = 1.0, damping: float = 1.5) -> NamedModel:

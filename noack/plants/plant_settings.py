@@ -7,6 +7,7 @@ other coordinates, and more of them.
 """
 
 import math
+import re
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -91,6 +92,11 @@ def name_and_unit(text: str) -> tuple[str, str]:
     """Return the name and the unit of a state or input that is described as "angle, rad"."""
     name, comma, unit = text.rpartition(", ")
     return (name, unit) if comma else (text, "")
+
+
+def plain_name(text: str) -> str:
+    """Return the name of a state or input that is described as "shaft angle, rad": shaft_angle."""
+    return re.sub(r"\W", "_", name_and_unit(text)[0])
 
 
 class PlantOutline(NamedTuple):

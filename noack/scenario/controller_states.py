@@ -106,7 +106,8 @@ def controlled_model(model: ModelSection, controller: StateSpaceSettings) -> Mod
     return model.model_copy(update={
         "name": None, "parameters": {}, "A": rows_of(_with_states(A, controller)),
         "B": rows_of(np.pad(B, ((0, k), (0, 0)))), "gain": rows_of(np.hstack([D, np.array(controller.C)])),
-        "state_names": (*given, *names) if given else None, "controller_states": k,
+        "state_names": (*given, *names) if given else None,
+        "state_units": model.state_units and (*model.state_units, *("",) * k), "controller_states": k,
     })  # fmt: skip
 
 

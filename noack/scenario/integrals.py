@@ -14,6 +14,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.linear import NAMED_MODELS
 from noack.protocol.record_tables import entry_names
+from noack.scenario.sections import instability
 from noack.settings.section import ReadTable
 
 _HELD = 1e-9
@@ -107,6 +108,9 @@ def _converted(table: ReadTable, whole: ReadTable, source: str) -> ReadTable:
         raise refuse('model.integral = []: give the names of outputs, e.g. "angle", or leave it out')
     if (kind := controller.get("kind", "linear")) != "linear":
         raise refuse(f'model.integral: not with controller.kind = "{kind}", which has states of its own')
+    if len({*names}) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise refuse(f'model.integral: "{twice}" occurs twice; name each output once')
     rows = {**dict(zip(states, np.eye(len(A)), strict=True)), **_outputs(whole.get("outputs"), states)}
     for name in names:
         if name not in rows:
@@ -124,6 +128,12 @@ def _converted(table: ReadTable, whole: ReadTable, source: str) -> ReadTable:
         raise refuse(
             f"model.gain: {found}, expected {m} x {n + k}: with model.integral it has a column for each "
             f"integral, too; noack gain --integral {','.join(names)} computes one"
+        )
+    whole_loop = (*augmented(A, B, np.array([*chosen.values()])), gain)
+    if not model.get("allow_unstable") and (reason := instability(*whole_loop)) is not None:
+        raise refuse(
+            f"model.gain: with model.integral, {reason}; to run the unstable loop anyway, set "
+            "model.allow_unstable = true"
         )
     state_space = {
         "kind": "state_space", "A": np.zeros((k, k)).tolist(),

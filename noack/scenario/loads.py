@@ -144,7 +144,9 @@ def loaded_model(model: ModelSection) -> ModelSection:
     names = ("load",) if k == 1 else tuple(f"load_{number + 1}" for number in range(k))
     return model.model_copy(update={
         "A": rows_of(_with_loads(A, E)), "B": rows_of(_below(B, k)), "gain": rows_of(np.hstack([K, gain])),
-        "state_names": (*(model.state_names or ()), *names), "load": None, "hold": None, "load_states": k,
+        "state_names": (*(model.state_names or ()), *names),
+        "state_units": model.state_units and (*model.state_units, *("",) * k),
+        "load": None, "hold": None, "load_states": k,
     })  # fmt: skip
 
 

@@ -9,10 +9,9 @@ from typing import Annotated, NamedTuple
 
 from pydantic import Field
 
-from noack.plants.plant_settings import name_and_unit
-from noack.settings.section import Positive, Row, ScenarioSection, require_length
+from noack.settings.section import Positive, Row, ScenarioSection, Unit, require_length
 
-_LONGEST_NAME, _LONGEST_UNIT = 64, 24
+_LONGEST_NAME = 64
 DISTANCE = "output "
 """What the name of an output's distance begins with."""
 
@@ -22,8 +21,8 @@ class OutputSection(ScenarioSection):
 
     name: Annotated[str, Field(min_length=1, max_length=_LONGEST_NAME)]
     """The output's name."""
-    unit: Annotated[str, Field(max_length=_LONGEST_UNIT)] = ""
-    """Its unit, e.g. "rad"."""
+    unit: Unit = ""
+    """Its unit, e.g. "rad"; by default that of the state, if it is one."""
     row: Row | str | None = None
     """The factors of the states whose sum it is, n entries, or the name of one state. By default the
     state of the output's name."""
@@ -55,7 +54,7 @@ class LoopOutput(NamedTuple):
 def loop_outputs(
     sections: Sequence[OutputSection] | None,
     state_names: Sequence[str],
-    described: Sequence[str] = (),
+    state_units: Sequence[str] | None = None,
     further: int = 0,
 ) -> tuple[LoopOutput, ...]:
     """Return the outputs of a loop, p of them.
@@ -63,15 +62,15 @@ def loop_outputs(
     Args:
         sections: those of the scenario; None: the states of the plant.
         state_names: the names of the states.
-        described: the states as the plant's kind describes them, e.g. "angle, rad"; may be empty.
+        state_units: their units, if they are known.
         further: the number of the last states that are not the plant's: loads, or the controller's.
 
     Raises:
         ValueError: a row does not fit; the message begins with its key.
     """
     n = len(state_names)
+    units = state_units or [""] * n
     if sections is None:
-        units = [name_and_unit(text)[1] for text in described] or [""] * n
         names = zip(state_names[: n - further], units, strict=False)
         return tuple(LoopOutput(name, unit, _unit_row(i, n)) for i, (name, unit) in enumerate(names))
     found = list[LoopOutput]()
@@ -82,7 +81,8 @@ def loop_outputs(
         if not section.name.isprintable() or not section.unit.isprintable():
             raise ValueError(f"{key}.name: name and unit must be printable, on one line")
         row = _row_of(section, f"{key}.row", state_names)
-        found.append(LoopOutput(section.name, section.unit, row, section.allowed))
+        unit = section.unit or next((units[i] for i in range(n) if row == _unit_row(i, n)), "")
+        found.append(LoopOutput(section.name, unit, row, section.allowed))
     return tuple(found)
 
 

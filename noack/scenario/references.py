@@ -66,7 +66,7 @@ def scenario_segments(scenario: ScenarioTables) -> list[ReferenceSegment] | None
         return [_solution(A, B, np.eye(own, n), signals, 0, 1.0, np.zeros(n))]
     if n > own and isinstance(pieces[0], FilePiece):
         raise PieceError(0, "kind: a file has no states of the controller; give steps, ramps or sines")
-    states, _ = given.entry_names
+    states, _ = scenario.entry_names
     rows = dict(zip(states[:own], np.eye(own, n), strict=True))
     for output in scenario.loop_outputs():
         rows[output.name] = np.pad(np.array(output.row)[:n], (0, max(n - len(output.row), 0)))

@@ -317,7 +317,7 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
     states of the model, if there are any; a reference becomes segments (``references.py``).
     """
     scenario, plant = loops[0], loops[0].plant
-    explicit = _explicit_model(scenario.model)
+    explicit = _explicit_model(scenario.named_model)
     is_drawn = (
         plant.initial_state_halfwidth is not None
         or plant.load_halfwidth is not None
@@ -375,20 +375,20 @@ def _resolved_plant(loop: Scenario, model: ModelSection) -> PlantSection:
 
 
 def _explicit_model(model: ModelSection) -> ModelSection:
-    state_names, input_names = model.entry_names
     if model.name is not None:
         named_model = model.named
         return ModelSection(
             A=rows_of(named_model.A),
             B=rows_of(named_model.B),
             gain=model.gain or rows_of(named_model.K),
-            state_names=state_names,
-            input_names=input_names,
+            state_names=model.state_names,
+            state_units=model.state_units,
+            input_names=model.input_names,
             load=model.load,
             hold=model.hold,
             allow_unstable=model.allow_unstable,
         )
-    return model.model_copy(update={"state_names": state_names, "input_names": input_names})
+    return model
 
 
 def _controller(scenario: Scenario) -> ControllerSettings:

@@ -198,7 +198,7 @@ def _with_reference(loop: Scenario, folder: Path, place: str) -> dict[str, Scena
     if not isinstance(piece, FilePiece) or piece.file is None:
         return {}
     file = NamedFile(piece.file, folder, f"{place}controller.reference.0")
-    read = controller.model_copy(update={"reference": (piece.read(file, *loop.model.entry_names),)})
+    read = controller.model_copy(update={"reference": (piece.read(file, *loop.entry_names),)})
     try:
         check_reference(loop.model_copy(update={"controller": read}))
     except ValueError as error:

@@ -16,7 +16,6 @@ from noack.core.errors import CallerError
 from noack.core.number_format import as_html, as_text
 from noack.core.periods import Period, exact_ns, period_of, simplest_fraction
 from noack.plants.linear import LinearSettings
-from noack.protocol.record_tables import entry_names
 from noack.protocol.roles import PROTOCOLS, LoopProtocol
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
 from noack.scenario.outputs import LoopOutput, OutputSection, loop_outputs
@@ -85,11 +84,20 @@ class ScenarioTables(ScenarioSection):
 
     def loop_outputs(self) -> tuple[LoopOutput, ...]:
         """Return the outputs; raise ValueError, with the key, if a row does not fit."""
-        names = self.model.state_names or (self.model.name and self.model.named.state_names)
-        n = self.model.dimensions[0]
-        described = self.plant.system.states
-        further = n - self.model.plant_states
-        return loop_outputs(self.outputs, names or entry_names("x", n), described, further)
+        model = self.named_model
+        further = model.dimensions[0] - model.plant_states
+        return loop_outputs(self.outputs, model.state_names or (), model.state_units, further)
+
+    @property
+    def named_model(self) -> ModelSection:
+        """The model, with names of its states and inputs, and with units where they are known."""
+        return self.model.with_names(self.plant.system)
+
+    @property
+    def entry_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The names of the states and of the inputs."""
+        model = self.named_model
+        return model.state_names or (), model.input_names or ()
 
     @property
     def states(self) -> int:

@@ -30,7 +30,7 @@ from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.lossless import NoLoss
 from noack.observers.observer_settings import NoiseVariances, ObserverSettings
 from noack.plants.linear import NAMED_MODELS, LinearSettings, NamedModel, parameters_of
-from noack.plants.plant_settings import PlantSettings
+from noack.plants.plant_settings import PlantSettings, name_and_unit, plain_name
 from noack.protocol.record_tables import entry_names
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
 from noack.settings.section import (
@@ -43,6 +43,7 @@ from noack.settings.section import (
     RateHz,
     Row,
     ScenarioSection,
+    Unit,
     kinds_in,
     require_distinct,
     require_length,
@@ -100,7 +101,11 @@ class ModelSection(ScenarioSection):
     names: dict[Literal["A", "B", "gain"], str] | None = None
     """Names of the arrays in the file, if they differ from A, B and gain."""
     state_names: tuple[str, ...] | None = None
-    """Names of the n states, for plots."""
+    """Names of the n states, for outputs, tables and plots; by default those of a named model or of the
+    plant's kind, if it has names."""
+    state_units: tuple[Unit, ...] | None = None
+    """Units of the n states, e.g. ["rad", "rad/s"]; "" for one without a unit. By default those of a
+    named model or of the plant's kind."""
     input_names: tuple[str, ...] | None = None
     """Names of the m inputs, for plots."""
     load: Literal["input"] | MatrixRows | None = None
@@ -131,11 +136,11 @@ class ModelSection(ScenarioSection):
         n, m = self.dimensions
         require_shape(self.gain, "gain", (m, n), "one row per input, one column per state")
         require_length(self.state_names, "state_names", n, "one name per state")
+        require_length(self.state_units, "state_units", n, "one unit per state")
         require_length(self.input_names, "input_names", m, "one name per input")
         require_distinct(self.state_names, "state_names")
         require_distinct(self.input_names, "input_names")
         self._check_loads(n)
-        self._require_stable()
         if self.integral is not None:  # loading a scenario replaces it
             raise ValueError("integral: it is read where a scenario file is loaded; give a controller here")
         return self
@@ -161,12 +166,16 @@ class ModelSection(ScenarioSection):
             if name not in known:
                 raise ValueError(f"hold: no state is named {name}; they are {', '.join(known)}")
 
-    def _require_stable(self) -> None:
+    def require_stable(self) -> None:
+        """Raise ValueError unless the closed loop Â + B̂K is stable, or may be unstable.
+
+        The message begins with the key. A controller with states of its own replaces this loop by another.
+        """
         (A, B), uses_named_gain = self.matrices, self.gain is None  # a named model's own gain
         K = self.named.K if uses_named_gain else np.array(self.gain)
         n = self.dimensions[0] - self.load_states
         A, B, K = A[:n, :n], B[:n], K[:, :n]  # a constant load does not decay
-        key = "parameters" if uses_named_gain else "gain"
+        key = "model.parameters" if uses_named_gain else "model.gain"
         if not np.isfinite(_closed_loop(A, B, K)).all():
             raise ValueError(f"{key}: A + BK has infinite entries; check the units of A, B and K")
         if not self.allow_unstable and (reason := instability(A, B, K)) is not None:
@@ -242,14 +251,24 @@ class ModelSection(ScenarioSection):
             return self.named.A, self.named.B
         return np.array(self.A), np.array(self.B)
 
-    @property
-    def entry_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """The names of the states and of the inputs."""
+    def with_names(self, system: PlantSettings) -> Self:
+        """Return the model with names of its states and inputs, and their units where they are known.
+
+        Names and units that it does not give are those of the named model, or of the plant's kind.
+        """
         n, m = self.dimensions
-        states, inputs = self.state_names, self.input_names
-        if self.name is not None:
-            states, inputs = states or self.named.state_names, inputs or self.named.input_names
-        return states or entry_names("x", n), inputs or entry_names("u", m)
+        named = None if self.name is None else self.named
+        described, driven = system.states, system.inputs
+        of_plant = tuple(map(plain_name, described)) if len(described) == self.plant_states == n else None
+        units = tuple(name_and_unit(text)[1] for text in described) if of_plant else None
+        of_inputs = tuple(map(plain_name, driven)) if len(driven) == m else None
+        if named is not None:
+            of_plant, units, of_inputs = named.state_names, named.state_units, named.input_names
+        return self.model_copy(update={
+            "state_names": self.state_names or of_plant or entry_names("x", n),
+            "state_units": self.state_units or units,
+            "input_names": self.input_names or of_inputs or entry_names("u", m),
+        })  # fmt: skip
 
     @property
     def trigger_matrices(self) -> ModelMatrices:

@@ -40,6 +40,7 @@ Table = dict[str, object]
 ReadTable = Mapping[str, object]
 """The same, where it is only read."""
 Positive = Annotated[FiniteFloat, Field(gt=0)]
+Unit = Annotated[str, Field(max_length=24)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Correlation = Annotated[FiniteFloat, Field(ge=0, lt=1)]

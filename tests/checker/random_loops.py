@@ -90,3 +90,15 @@ def random_loop_with_long_delays(rng: np.random.Generator) -> Loop:
     rule = rule._replace(always=bool(kind == "deadline"))
     times = loop.times._replace(sampling=sampling, least_sampling=least, delay=delay, start=min(start, delay))
     return loop._replace(rule=rule, times=times)
+
+
+def random_quadratic_loop(rng: np.random.Generator) -> Loop:
+    """Return a loop whose rule is a quadratic form with mixed terms, sometimes with noise."""
+    loop = random_loop(rng)
+    n = loop.n
+    of_errors, mixed = rng.normal(size=(n, n)), 0.02 * rng.normal(size=(n, n))
+    positive = np.hstack([mixed, of_errors @ of_errors.T + 0.3 * np.eye(n)]).round(3)
+    negative = np.hstack([0.02 * rng.normal(size=(n, n)), 0.1 * rng.normal(size=(n, n))]).round(3)
+    rule = loop.rule._replace(positive=matrix(positive.tolist()), negative=matrix(negative.tolist()))
+    noise = number(0.003) * identity(n) if rng.random() < 0.3 else loop.noise
+    return loop._replace(rule=rule, noise=noise)

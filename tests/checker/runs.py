@@ -64,8 +64,10 @@ class _Plant:
         return np.asarray(expm(F * dt))
 
 
-def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -> list[Exceeded]:
-    """Return where a random run exceeds what is proven."""
+def exceeded(
+    loop: Loop, proof: Proof, rng: np.random.Generator, until: float, *, by_forms: bool = True
+) -> list[Exceeded]:
+    """Return where a random run exceeds what is proven; by forms this is a root of a sum of squares."""
     plant, times, rule = _Plant(loop, rng), [float(t.p) / float(t.q) for t in loop.times], loop.rule
     sampling, least, delay, age, start, *periods, dwell = times
     next_event = rng.choice(periods) if periods[1] else np.inf  # of a periodic rule
@@ -119,7 +121,8 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
             decay = plant.predict(round((stop - t) / 2, 12))
             arriving = [(acts, sent, decay @ state) for acts, sent, state in arriving]
             compared = bounds if acting is not None else early
-            _compare(found, plant, z, W, t + half * (stop - t) / 2, compared, r, acting, signs)
+            at = t + half * (stop - t) / 2
+            _compare(found, plant, z, W, at, compared, r, acting, signs, by_forms=by_forms)
         t = stop
         if acting_now := [update for update in arriving if update[0] <= t]:
             newest = max(acting_now, key=lambda update: update[1])
@@ -202,6 +205,8 @@ def _compare(
     rate: float,
     age: float | None,
     signs: tuple[float, ...],
+    *,
+    by_forms: bool,
 ) -> None:
     n = plant.n
     x, xs, xc = z[:n], z[n : 2 * n], z[2 * n : 3 * n]
@@ -211,7 +216,7 @@ def _compare(
     entries = {"x": x, "u": u, "y": plant.outputs @ x}
     for output, decaying, constant in bounds:
         value = values[output] if output in values else entries[output[0]][[int(output[2:-1])]]
-        added = np.add if output in {"e_s", "e_c"} else np.hypot
+        added = np.hypot if by_forms and output not in {"e_s", "e_c"} else np.add
         size, bound = float(np.linalg.norm(value)), float(added(decaying * np.exp(-rate * t), constant))
         if size > bound * (1 + _ROUNDING):
             found.append(Exceeded(output, t, size, bound))

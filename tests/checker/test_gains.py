@@ -18,12 +18,14 @@ from noack_check.check import RejectedError
 from noack_check.loop import Loop, Times
 from noack_check.proof import Proof, prove
 from noack_check.responses import Decay, responses, responses_until
+from noack_check.scenario import _squares
 from noack_check.sentences import smallest_bounds
 from tests.checker.random_loops import (
     random_loop,
     random_loop_with_long_delays,
     random_noisy_loop,
     random_periodic_loop,
+    random_quadratic_loop,
 )
 from tests.checker.runs import exceeded
 from tests.checker.test_false_witnesses import WRONG
@@ -206,10 +208,87 @@ def test_a_loop_gain_above_1_is_rejected() -> None:
 def test_what_is_not_covered_is_rejected() -> None:
     loop = double_integrator()
     document = by_gains(loop)[0]
-    mixed = loop.rule._replace(positive=matrix([[1, 0, 1, 0], [0, 0, 0, 1]]))
-    for other in (loop._replace(rule=mixed),):
-        with pytest.raises(RejectedError, match=r"^gains: "):
-            prove(other, document)
+    with pytest.raises(RejectedError, match=r"^gains: "):
+        prove(loop._replace(loads=1), document)
+
+
+# Rules with terms of x and e_s.
+
+
+def with_form(loop: Loop, Q: list[list[float]], epsilon: float = 0.0004) -> Loop:
+    """Return a loop with the rule zᵀQz > ε."""
+    positive, negative = _squares(matrix(Q))
+    rule = loop.rule._replace(
+        positive=positive, negative=negative, level=arb(0), floor=number(epsilon).sqrt()
+    )
+    return loop._replace(rule=rule)
+
+
+FORM = [[-1e-4, 0.0, 0.006, 0.0], [0.0, -2e-4, 0.0, 0.005], [0.006, 0.0, 2.0, 0.4], [0.0, 0.005, 0.4, 1.5]]
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [("errors", 1.001), ("share", 0.999), ("shift", 0.98), ("shift", 1.02)]
+)
+def test_a_silent_test_that_says_less_is_rejected(name: str, factor: float) -> None:
+    loop = with_form(double_integrator(SCHEDULE), FORM)
+    document = copy.deepcopy(by_gains(loop)[0])
+    prove(loop, document)
+    rows = document["gains"]["comparison"][name]
+    document["gains"]["comparison"][name] = [[factor * entry for entry in row] for row in rows]
+    with pytest.raises(RejectedError, match="a silent test does not say as much"):
+        prove(loop, document)
+
+
+def test_a_comparison_is_needed_of_the_right_size() -> None:
+    loop = with_form(double_integrator(SCHEDULE), FORM)
+    document = by_gains(loop)[0]
+    for change in ({"shift": [[0.0]]}, {"share": [[0.1]]}, {"errors": [[1.0, 0.0]]}):
+        other = copy.deepcopy(document)
+        other["gains"]["comparison"] |= change
+        with pytest.raises(RejectedError, match="another size"):
+            prove(loop, other)
+    del document["gains"]["comparison"]
+    with pytest.raises(RejectedError, match="a comparison is needed"):
+        prove(loop, document)
+
+
+@pytest.mark.parametrize("factor", [1.3, 3.0])
+def test_a_witness_of_a_rule_does_not_prove_bounds_of_a_laxer_one(factor: float) -> None:
+    loop = with_form(double_integrator(SCHEDULE), FORM)
+    laxer = [
+        [entry * (factor if (i < 2) != (j < 2) else 1.0) for j, entry in enumerate(row)]
+        for i, row in enumerate(FORM)
+    ]
+    with pytest.raises(RejectedError, match="a silent test does not say as much"):
+        prove(with_form(loop, laxer), by_gains(loop)[0])
+
+
+def test_a_rule_that_says_nothing_of_an_error_has_no_bounds_by_gains() -> None:
+    loop = with_form(double_integrator(SCHEDULE), [[*row[:3], 0.0] for row in FORM[:3]] + [[0.0] * 4])
+    with pytest.raises(NoWitnessError, match="may still have any size"):
+        by_gains(loop)
+
+
+def test_a_completed_square_is_as_good_as_the_rule_that_it_is() -> None:
+    """‖2e_s‖² > θ² + ‖0.1x‖² as a form has the bounds of ‖e_s‖ > θ/2, with 0.05x."""
+    loop = double_integrator(SCHEDULE)
+    rule = loop.rule._replace(
+        level=arb(0), floor=number(0.02), negative=number(0.05) * beside(identity(2), zeros(2, 2))
+    )
+    form = [[-0.01 * (i == j) if i < 2 else 4.0 * (i == j) for j in range(4)] for i in range(4)]
+    own, other = (
+        sizes(by_gains(each)[1]) for each in (loop._replace(rule=rule), with_form(loop, form, 0.0016))
+    )
+    assert other == pytest.approx(own, rel=1e-4)
+
+
+def test_a_threshold_and_a_share_of_x_do_not_add_up() -> None:
+    """Without losses and delays ‖e_s‖ ≤ √(θ² + s²) with s = σ sup |x|."""
+    loop = scalar(0)._replace(start=number(0.2) * identity(1))
+    loop = loop._replace(rule=loop.rule._replace(negative=number(0.1) * matrix([[1, 0]])))
+    found = sizes(by_gains(loop)[1])
+    assert found["e_s"] == pytest.approx(math.hypot(0.1, 0.1 * found["x"]), rel=1e-3)
 
 
 LIES: dict[str, tuple[Loop, Callable[[Loop], Loop]]] = {
@@ -242,6 +321,13 @@ LIES: dict[str, tuple[Loop, Callable[[Loop], Loop]]] = {
         ),
         lambda loop: loop._replace(rule=loop.rule._replace(negative=zeros(0, 2))),
     ),
+    "a term of x and e_s": (
+        scalar(0, SCHEDULE)._replace(
+            rule=scalar().rule._replace(positive=matrix([[0.3, 1.0]]), level=arb(0), floor=number(0.02)),
+            pushes=identity(1), sizes=(number(0.1),),
+        ),
+        lambda loop: loop._replace(rule=loop.rule._replace(positive=matrix([[0, 1]]))),
+    ),
     "slow tests": (
         changed(scalar(0, SCHEDULE), sampling=fmpq(1, 5), least_sampling=fmpq(1, 5)),
         lambda loop: changed(loop, sampling=fmpq(1, 100), least_sampling=fmpq(1, 100)),
@@ -254,11 +340,17 @@ def test_a_proof_that_leaves_out_a_condition_is_exceeded_by_runs(left_out: str) 
     loop, lie = LIES[left_out]
     true, false = by_gains(loop)[1], by_gains(lie(loop))[1]
     until, seeds = 6.0, range(8)
-    assert any(exceeded(loop, false, np.random.default_rng(seed), until) for seed in seeds)
-    assert not any(exceeded(loop, true, np.random.default_rng(seed), until) for seed in seeds)
+    assert any(exceeded(loop, false, np.random.default_rng(seed), until, by_forms=False) for seed in seeds)
+    assert not any(exceeded(loop, true, np.random.default_rng(seed), until, by_forms=False) for seed in seeds)
 
 
-DRAWS = (random_loop, random_periodic_loop, random_noisy_loop, random_loop_with_long_delays)
+DRAWS = (
+    random_loop,
+    random_periodic_loop,
+    random_noisy_loop,
+    random_loop_with_long_delays,
+    random_quadratic_loop,
+)
 
 
 @pytest.mark.parametrize("draw", DRAWS)
@@ -273,7 +365,7 @@ def test_bounds_of_random_loops_are_not_exceeded(draw: Callable[[np.random.Gener
             continue
         found += 1
         step = loop.times.sampling if loop.times.sampling > 0 else loop.times.period / 5
-        assert exceeded(loop, proof, rng, 200 * float(arb(step))) == []
+        assert exceeded(loop, proof, rng, 200 * float(arb(step)), by_forms=False) == []
     assert found
 
 
@@ -296,8 +388,8 @@ def least_sizes(loop: Loop) -> dict[str, float]:
         lambda loop: loop._replace(half_B=number(0.05) * identity(1)),
         lambda loop: loop._replace(model_A=number(0.9) * identity(1)),
         lambda loop: loop._replace(rule=loop.rule._replace(level=number(0.12))),
-        lambda loop: loop._replace(rule=loop.rule._replace(floor=number(0.03))),
         lambda loop: loop._replace(rule=loop.rule._replace(negative=number(0.01) * matrix([[1, 0]]))),
+        lambda loop: loop._replace(rule=loop.rule._replace(positive=matrix([[0.01, 1]]))),
     ],
     ids=[
         "losses",
@@ -312,8 +404,8 @@ def least_sizes(loop: Loop) -> dict[str, float]:
         "B",
         "model",
         "level",
-        "floor",
         "share",
+        "mixed",
     ],
 )
 def test_each_condition_counts(change: Callable[[Loop], Loop]) -> None:
@@ -321,3 +413,27 @@ def test_each_condition_counts(change: Callable[[Loop], Loop]) -> None:
     before, after = least_sizes(loop), least_sizes(change(loop))
     assert after["x"] > before["x"] * 1.001
     assert min(after[name] / before[name] for name in before) > 1 - 1e-6
+
+
+def test_a_floor_counts_in_the_limit() -> None:
+    """Near the start a larger one costs nothing: the threshold is the larger one of both parts."""
+    loop = scalar(times=SCHEDULE, floor=0.02)
+    higher = loop._replace(rule=loop.rule._replace(floor=number(0.03)))
+    before, after = (sizes(by_gains(each)[1], from_start=False) for each in (loop, higher))
+    assert after["x"] == pytest.approx(1.5 * before["x"], rel=1e-3)
+
+
+def test_two_parts_of_a_threshold_do_not_add_up() -> None:
+    """Without losses and delays ‖e_s‖ ≤ max(0.1 e^{−rt}, 0.04)."""
+    found = {bound.output: bound for bound in by_gains(scalar(0, floor=0.04))[1].bounds if bound.from_start}
+    assert float(found["e_s"].decaying) == pytest.approx(0.06, rel=1e-3)
+    assert float(found["e_s"].constant) == pytest.approx(0.04, rel=1e-3)
+
+
+def test_no_input_at_first_counts_once() -> None:
+    """What acts before the first input, p = −Kx, drives an error for as long, however long a period is."""
+    loop = scalar(2, SCHEDULE)._replace(start=100 * identity(1))
+    loop = changed(loop, period=fmpq(1, 10), least_period=fmpq(1, 10))._replace(
+        rule=loop.rule._replace(positive=zeros(0, 2), level=arb(0))
+    )
+    assert sizes(by_gains(loop)[1])["e_c"] < 25  # it would drive errors to 2 · 100 · 0.32 s within Mh + d

@@ -31,10 +31,8 @@ REFUSED = {
     "plant.measurement.noise_std=[0.1, 0.0]": "plant.measurement.noise_std",
     'plant.disturbances=[{kind="gaussian", std=[0.1]}]': "plant.disturbances.kind",
     "controller.safe_input=[1.0]": "controller.safe_input",
-    "controller.predictions=3": "controller.predictions",
     "controller.update_timeout_s=1.0": "controller.update_timeout_s",
     "network.protocol=ack": "network.protocol",
-    "network.actuation.mansd=1": "network.actuation.mansd",
     'network.impairments=[{kind="rate", rate_bps=1000000}]': "certificate.network_delay_s",
 }
 
@@ -51,6 +49,7 @@ def test_what_no_statement_covers_is_refused(setting: str) -> None:
     [
         ("plant.measurement.noise_std=[0.0, 0.0]",),
         ("controller.safe_input=[0.0]",),
+        ("network.actuation.mansd=1", "controller.predictions=3"),
         ("controller.safe_input=[1.0]", "network.initial_sync=known_state"),
         ("changes=[{at_s=1.0, set={'network.loss.probability'=0.9}}]",),
         ('network.impairments=[{kind="rate", rate_bps=1000000}]', "certificate.network_delay_s=0.1"),

@@ -12,6 +12,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
+from noack.scenario.sections import ActuationSection
 from noack.theory.certificates.conditions import about_reference, allowed_conditions, ideal_conditions
 from noack_check.keys import RefusedError, key_table, refusals
 from noack_check.loop import Loop
@@ -24,7 +25,6 @@ LOADED = {"dc_motor_load", "lane_crosswind_load"}
 NAMES = sorted({file.stem for file in SCENARIOS.glob("*.toml")} - LOADED)
 REFUSED = {
     "cart_pole", "dc_motor", "four_tank", "friction_servo", "kinematic_car", "lane_acknowledged",
-    "lane_actuation_loss",
     "lane_python_trigger", "model_predictive", "pendulum_observed", "quadrotor_hover", "saturated_lqr",
     "sine_pendulum",
 }  # fmt: skip
@@ -135,7 +135,7 @@ RATES = (500.0, 1000.0, 100.0, 50.0, 40.0, 25.0, 30.0, 60.0, 90.0, 120.0, 144.0,
 
 
 def test_times_are_those_of_noack() -> None:
-    """200 draws, of which most have a period that is no whole number of nanoseconds."""
+    """200 draws, of which most have a period that is no whole number of nanoseconds; some lose inputs."""
     draw, base = random.Random(5), first_loop("double_integrator")
     uneven = 0
     for number in range(200):
@@ -148,8 +148,15 @@ def test_times_are_those_of_noack() -> None:
             "late_periods": draw.choice((0, 0, 1, 2, 9)),
             "network_delay_s": draw.choice((None, 0.0, 0.001, 0.02, 1 / 30, draw.uniform(0, 0.3))),
         }
+        inputs = None
+        if draw.random() < 0.5:
+            delay_s = draw.choice((0.0, 0.0, 0.001, 0.02, draw.uniform(0, 0.1)))
+            impairments = ({"kind": "delay", "delay_s": delay_s},) if delay_s else ()
+            inputs = ActuationSection.model_validate({"mansd": draw.randrange(4), "impairments": impairments})
+            controller["predictions"] = draw.randrange(1, 6)
         resolved = base.model_copy(
             update={
+                "network": base.network.model_copy(update={"actuation": inputs}),
                 "plant": base.plant.model_copy(update=plant),
                 "controller": base.controller.model_copy(update=controller),
                 "certificate": base.certificate.model_copy(update=certificate),
@@ -248,6 +255,35 @@ def test_a_watchdog_that_may_act_is_refused() -> None:
     with pytest.raises(RefusedError, match=r"plant.watchdog.timeout_s = 0.004"):
         read_loop(resolved_tables("double_integrator", *settings), box=False, ideal=False)
     read_loop(resolved_tables("double_integrator", settings[0]), box=False, ideal=False)
+
+
+def test_a_watchdog_that_may_act_on_inputs_from_the_network_is_refused() -> None:
+    """With predictions "hold" applies the last one, also if it is not due."""
+    settings = ("network.actuation.mansd=2", "controller.predictions=4", "controller.rate_hz=50")
+    for policy, timeout_s, least_s in (("hold", 0.059, 0.06), ("model", 0.065, 0.066)):
+        chosen = (*settings, f"plant.watchdog.policy={policy}", "plant.watchdog.timeout_s=0.5")
+        tables = resolved_tables("double_integrator", *chosen)
+        read_loop(tables, box=False, ideal=False)
+        tables["plant"]["watchdog"]["timeout_s"] = timeout_s
+        with pytest.raises(RefusedError, match=f"may be {least_s:g}"):
+            read_loop(tables, box=False, ideal=False)
+
+
+ACTUATIONS: dict[str, tuple[tuple[str, ...], str]] = {
+    "no limit of losses": (("network.actuation={}",), r"network.actuation.mansd: missing"),
+    "a jitter": (
+        ('network.actuation={mansd=1, impairments=[{kind="delay", delay_s=0.01, jitter_s=0.001}]}',),
+        r"network.actuation.impairments: delay: the delay is not constant",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", ACTUATIONS)
+def test_inputs_from_the_network_whose_age_has_no_bound_are_refused(case: str) -> None:
+    settings, message = ACTUATIONS[case]
+    with pytest.raises(RefusedError, match=message):
+        read_loop(resolved_tables("double_integrator", *settings), box=False, ideal=False)
+    read_loop(resolved_tables("double_integrator", *settings), box=False, ideal=True)
 
 
 @pytest.mark.parametrize(
@@ -351,13 +387,21 @@ def test_the_keys_that_the_table_calls_used_are_those_that_are_read() -> None:
     plant = ("plant.A=[[0.0, 1.0], [0.0, 0.0]]", "plant.B=[[0.0], [1.0]]")
     tables = resolved_tables("double_integrator", *settings, *plant)
     read_loop(Recorded(tables, read), box=False, ideal=False)
+    inputs = (
+        'network.actuation={mansd=3, constraints=[{kind="at_most", losses=2, window=9}], impairments=[DELAY]}'
+    )
+    settings = (inputs.replace("DELAY", '{kind="delay", delay_s=0.01}'), "controller.predictions=2")
+    read_loop(Recorded(resolved_tables("double_integrator", *settings), read), box=False, ideal=False)
     for name in ("dc_motor_load", "servo_reference"):
         read_loop(Recorded(resolved_tables(name), read), box=False, ideal=False)
     used = {key for key, (row, *_) in key_table().rows.items() if row.use == "used"}
     assert used <= read | {"network.initial_sync"}
     refused = {key for key, (row, *_) in key_table().rows.items() if row.use == "refused"}
     inner = {key.removesuffix(".*") for key in key_table().rows}
-    assert {key for key in read if key in inner} - refused - used <= {"network.impairments"}
+    assert {key for key in read if key in inner} - refused - used <= {
+        "network.impairments",
+        "network.actuation.impairments",
+    }
 
 
 def test_the_outputs_of_a_scenario_are_rows_with_names() -> None:

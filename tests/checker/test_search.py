@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
+from cosim.analysis.certificates import Certificates
 from noack.theory.witnesses import semidefinite
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.documents import find_witness
@@ -16,6 +17,7 @@ from noack.theory.witnesses.templates import Templates
 from noack_check.balls import matrix, number
 from noack_check.model import Model
 from tests.checker.test_witnesses import IDEAL, bounds_of, double_integrator
+from tests.helpers.shipped import resolved
 
 
 @pytest.mark.parametrize("lowest", [0.15, 0.42, 0.6, 0.85])
@@ -31,6 +33,19 @@ def test_the_lowest_value_is_found_with_few_values(lowest: float) -> None:
     assert len(values) <= 6
     assert all(0 < share < 1 for share in values)
     assert min(values.values()) < 1.05
+
+
+def test_a_loop_that_starts_at_rest_is_bounded() -> None:
+    """Nothing drives it: bounds of its drift are 0, and have no logarithm."""
+    certificates = Certificates(resolved(
+        "unstable_pendulum", "model={A=[[0.0, 1.0], [-2.0, -1.0]], B=[[0.0], [1.0]], gain=[[-1.0, -1.0]]}",
+        "plant={initial_state=[0.0, 0.0]}", 'outputs=[{name="x_1", allowed=0.05}]', "network.mansd=2",
+        "trigger={beta=0.05, alpha_per_s=0.3, floor=0.005}",
+    ), 2)  # fmt: skip
+    certificates.prove()
+    (bound,) = certificates.output_bounds(certificates.schedule)
+    assert bound.is_proven
+    assert bound.settles_s == 0
 
 
 def test_without_a_finite_value_the_search_ends() -> None:

@@ -71,13 +71,29 @@ def test_the_command_prints_a_contradiction_with_its_file(
 def test_a_run_that_exceeds_a_proven_bound_is_a_contradiction(tmp_path: Path) -> None:
     scenario = shipped("double_integrator", "horizon_s=2.0")
     ending = simulate_run(scenario, tmp_path)
-    outputs = ("x", "x[0]", "y[1]", "e_s", "e_c")
+    outputs = ("x", "x[0]", "y[0]", "e_s", "e_c")
     for size, is_exceeded in ((10.0, False), (1e-4, True)):
         checks = Checks(draw(SEED, 0), tmp_path, 60.0)
         bounds = tuple(Bound(output, arb(size), arb(0), from_start=True) for output in outputs)
         checks.compare(ending, Proof(arb(0), bounds, None, None, is_quiet=True))
         found = [contradiction.what.partition(" =")[0] for contradiction in checks.contradictions]
         assert found == [f"‖{output}‖" for output in outputs if is_exceeded]
+
+
+def test_a_search_that_takes_too_long_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checks = Checks(draw(SEED, 0), tmp_path, 0.05)
+    with checks.step("prove", searches=True):
+        while True:
+            pass
+    assert (checks.contradictions, checks.counts) == ([], {"prove: search too long": 1})
+    checked = Checked(SEED, 3, False, [], set(), checks.counts, Counter())
+    monkeypatch.setattr(command, "checked_draws", lambda *_, **__: iter([checked]))
+    assert command.main(["--failures", str(tmp_path)]) == 0
+    output = capsys.readouterr().out
+    assert f"draw 3 of seed {SEED}: prove: search too long\n" in output
+    assert "0 with a contradiction\n  prove: search too long: 1" in output
 
 
 def test_a_step_that_raises_or_takes_too_long_is_a_contradiction(tmp_path: Path) -> None:

@@ -3,12 +3,17 @@
 from cosim.shipped_files import find_shipped
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import load
+from noack.scenario.scenario_file import completed_with, setting_of
+from noack.scenario.toml_file import read
 
 
 def shipped(name: str, *settings: str) -> Scenario:
-    """Return a shipped scenario with settings."""
-    return load(find_shipped(name, "scenarios"), settings)
+    """Return a shipped scenario with settings; with another model its outputs are the states."""
+    path = find_shipped(name, "scenarios")
+    content, given = read(path, Scenario), [setting_of(setting) for setting in settings]
+    if "model" in dict(given):
+        content.pop("outputs", None)
+    return completed_with(content, given, path, "--set ")
 
 
 def resolved(name: str, *settings: str) -> Scenario:

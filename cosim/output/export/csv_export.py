@@ -8,7 +8,7 @@ import pyarrow as pa
 from pyarrow import csv
 
 from cosim.output.export.export_formats import ExportedRun
-from cosim.record.data_frames import events, samples, with_seconds
+from cosim.record.data_frames import events, samples, with_outputs, with_seconds
 from cosim.record.run_directory import write_output
 from cosim.record.table_files import arrow_table
 
@@ -33,7 +33,8 @@ def write(run: ExportedRun, folder: Path, *, certificates: bool = True) -> list[
 
 def _tables(run: ExportedRun) -> Iterator[tuple[str, pa.Table]]:
     for name in run.record.tables:
-        yield name, with_seconds(arrow_table(run.record[name]))
+        table = with_seconds(arrow_table(run.record[name]))
+        yield name, table if run.record.is_network else with_outputs(table, run.record.scenario)
     if not run.record.is_network:
         yield "samples", samples(run.record)
         yield "events", events(run.record)

@@ -99,6 +99,8 @@ _SLOWER = 0.5
 """Factor of α if nothing is proven with it."""
 _LEAST_USE, _MOST_USE = 0.6, 0.85
 """Shares of an allowed error that its bound has in the end: at least, and wanted."""
+_BESIDE = 1e-12
+"""How far beside a point ẋ is compared, relative to it: a difference is a jump."""
 _MOST_OUTPUTS = 4
 """Outputs of a plant that states no allowed error."""
 _START_FACTOR, _MOST_REDUCTIONS = 0.5, 5
@@ -272,10 +274,27 @@ def _require_rest(model: LinearModel) -> None:
         )
     if not model.rests:
         drift = ", ".join(f"{entry:.4g}" for entry in model.drift)
+        if _jumps_at_rest(model):
+            raise CallerError(
+                f"{label}: its equations jump at rest, where ẋ is ({drift}); dry friction of size f, such as "
+                "math.copysign(f, v), is f * np.tanh(v / w) with a small w"
+            )
         raise CallerError(
             f"{label}: a scenario needs an equilibrium; at the point ẋ is ({drift}). "
             "`noack linearise` shows where the linear model rests"
         )
+
+
+def _jumps_at_rest(model: LinearModel) -> bool:
+    """Return whether ẋ jumps where a state passes the point, by more than half of ẋ there."""
+    rates = getattr(model.plant.system_at(model.at), "rates", None)
+    for off in np.eye(model.plant.n) * _BESIDE * max(1.0, norm(model.at)):
+        ends = [None if rates is None else rates(model.at + moved, model.input) for moved in (off, -off)]
+        if ends[0] is None or ends[1] is None:
+            return False
+        if norm(ends[0] - ends[1]) > norm(model.drift) / 2:
+            return True
+    return False
 
 
 def _initial_state(model: LinearModel, fixed_state: object) -> Vector:
@@ -414,6 +433,7 @@ class _TrialScenarios:
                 "gain": trial.gain.K.tolist(),
                 **({"integral": [*trial.gain.integrals]} if trial.gain.integrals else {}),
                 "state_names": list(reference.state_names),
+                **({"state_units": list(reference.units)} if self._has_own_units else {}),
                 "input_names": list(reference.input_names),
             },
             "plant": {
@@ -440,6 +460,11 @@ class _TrialScenarios:
         for key, value in self._fixed_settings.items():
             put(content, key, value, f"--set {key}")
         return content
+
+    @property
+    def _has_own_units(self) -> bool:
+        """Whether the units of the states are not those of the plant's kind, which a scenario has anyhow."""
+        return any(self._model.plant.units) and not self._model.plant.system.states
 
     def _first_floor(self, trial: _Trial, beta: float) -> float:
         """Return the last threshold that is tried first."""

@@ -1,7 +1,6 @@
 """What PLANT may be on the command line: a class, a kind of plant, or what a kind gives a name."""
 
 import ast
-import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from noack.core.errors import CallerError, did_you_mean, one_line
 from noack.core.extension_points import missing_extension
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.linear import LinearSettings
-from noack.plants.plant_settings import PlantSettings, PlantStart, PlantSystem, name_and_unit
+from noack.plants.plant_settings import PlantSettings, PlantStart, PlantSystem, name_and_unit, plain_name
 from noack.plants.python_plant import PythonPlantSettings
 from noack.plants.systems.linearisation import STEP_NS
 from noack.scenario import scenario_file, toml_file
@@ -121,7 +120,7 @@ def plant_reference(
         names = _plain_names(outline.states), _plain_names(outline.inputs)
         return PlantReference(
             label, settings, system, outline.n, outline.m, names, rates, outline.initial_state,
-            _units(outline.states), {_plain(name): value for name, value in outline.allowed.items()},
+            _units(outline.states), {plain_name(name): value for name, value in outline.allowed.items()},
         )  # fmt: skip
     if isinstance(system, PythonPlantSettings):
         n, m = _sizes_of_class(system, label, sizes)
@@ -223,11 +222,7 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
 
 
 def _plain_names(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
-    return names and tuple(_plain(name_and_unit(name)[0]) for name in names)
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"\W", "_", name)
+    return names and tuple(map(plain_name, names))
 
 
 def _units(states: tuple[str, ...] | None) -> tuple[str, ...]:

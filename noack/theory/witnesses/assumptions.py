@@ -228,7 +228,9 @@ def inter_event_s(loop: Loop, rate: float, drift: Sequence[float]) -> float:
     at_once = share(0.0)
     if at_once >= _NEARLY:
         return 0.0
-    time = min(limit / size for limit, size, _ in triples if size)
+    time = min((limit / size for limit, size, _ in triples if size), default=0.0)
+    if not time:  # nothing drives the errors, so no time is the least one
+        return 0.0
     for _ in range(_MOST_STEPS):
         reached = share(time)
         if _NEARLY < reached < 1:

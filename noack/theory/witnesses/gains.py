@@ -14,7 +14,7 @@ from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.balls import number
 from noack_check.check import RejectedError
-from noack_check.gains import Gains
+from noack_check.gains import Gains, own_comparison
 from noack_check.loop import Loop
 from noack_check.proof import compares_error
 
@@ -22,6 +22,8 @@ _SHARES = (1.0, 0.5, 0.2, 0.0)
 """Rates that are tried, in multiples of the largest one."""
 _FIRST_S, _NEARLY, _STEPS = 1e-6, 0.98, 12
 """A time between events is accepted if e_s reaches nearly the threshold."""
+_SLACK = 1e-10
+"""Of the quadratic form of a rule, relatively, in the inequality of what a silent test says."""
 
 
 def find_gains(loop: Loop, rate: float, outputs: Sequence[str]) -> dict[str, object]:
@@ -37,6 +39,8 @@ def find_gains(loop: Loop, rate: float, outputs: Sequence[str]) -> dict[str, obj
     }
     if loop.losses and not loop.times.period > 0 and (rate or not loop.holds):
         table["model"] = _lyapunov(floats(loop.H), rate, "the model")
+    if not loop.times.period > 0 and own_comparison(loop) is None:
+        table["comparison"] = _comparison(loop)
     try:
         gains = Gains(loop, number(rate), table)
     except RejectedError as error:
@@ -84,6 +88,24 @@ def _lyapunov(M: Matrix, rate: float, name: str) -> dict[str, object]:
     except NotDecayingError as error:
         raise NoWitnessError(f"{name}: {error}") from None
     return {"form": form.tolist(), "decay": decay}
+
+
+def _comparison(loop: Loop) -> dict[str, object]:
+    """Return Y, J and S: the square of the rule's form on (x, e_s) is completed."""
+    n, P, N = loop.n, floats(loop.rule.positive), floats(loop.rule.negative)
+    if P.shape[1] != 2 * n:
+        raise NoWitnessError("the rule is none of x and e_s")
+    Q = P.T @ P - N.T @ N
+    of_errors, cross = Q[n:, n:], Q[n:, :n]
+    values = np.linalg.eigvalsh(of_errors)
+    if not values[0] > 1e-9 * abs(values[-1]):
+        raise NoWitnessError("where the rule does not transmit, e_s may still have any size")
+    Y = np.sqrt(1 - _SLACK) * np.linalg.cholesky(of_errors).T
+    J = np.linalg.solve(of_errors, cross)
+    values, vectors = np.linalg.eigh(cross.T @ J - Q[:n, :n])
+    values = np.maximum(values, 0.0) + _SLACK * max(np.linalg.norm(Q[:n]), 1e-9 * np.linalg.norm(Q))
+    share = np.sqrt(values)[:, None] * vectors.T
+    return {"errors": Y.tolist(), "shift": J.tolist(), "share": share.tolist()}
 
 
 def _inter_event_s(gains: Gains) -> float:

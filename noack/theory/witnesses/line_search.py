@@ -20,7 +20,7 @@ def search_lowest(
     """Call a function at shares between 0 and 1: downhill from a first one, then where a parabola is lowest.
 
     Args:
-        value: the function; it is positive, or infinite, and called once for each share.
+        value: the function; it is at least 0, or infinite, and called once for each share.
         first: the first share.
         most: calls, without the last one.
         upwards: the second share is above the first one.
@@ -41,6 +41,8 @@ def search_lowest(
         step = -step
     while size(following := _moved(share, step)) < size(share):
         share = following
+    if min(known.values()) <= 0:  # nothing is lower: a loop that starts at rest
+        return
     lowest = _lowest_point({s: log(v) for s, v in known.items() if isfinite(v)})
     if lowest is not None:
         value(lowest)

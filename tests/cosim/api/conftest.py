@@ -13,7 +13,8 @@ TRUE = ([[0.0, 1.0], [9.6, -0.15]], [[0.0], [1.0]])
 def scenario() -> noack.Scenario:
     """A pendulum that differs slightly from the model, with a network that loses most updates."""
     settings = {"horizon_s": 4.0, "network.loss.probability": 0.8}
-    return noack.from_system(SYSTEM, GAIN, [0.2, 0.0], plant=TRUE, settings=settings)
+    names = ["angle", "rate"]
+    return noack.from_system(SYSTEM, GAIN, [0.2, 0.0], plant=TRUE, state_names=names, settings=settings)
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ from tests.helpers.command_line import invoke
 
 
 def guarantee_line(scenario: str, **settings: object) -> str:
-    line = noack.simulate(noack.load(scenario, {"horizon_s": 1.0, **settings})).verdict[1]
+    line = noack.simulate(noack.load(scenario, {"horizon_s": 1.0, **settings})).verdict[-2]
     assert line.tone == Tone.DOUBTFUL
     return line.text
 
@@ -28,7 +28,7 @@ def test_a_run_that_no_certificate_covers_says_why_as_certify_does(name: str) ->
 def test_the_answer_of_certify_is_that_of_the_run(name: str, is_certified: bool) -> None:
     answer = noack.certify(name, search=False).answer
     assert answer.is_certified == is_certified
-    line = noack.simulate(noack.load(name, {"horizon_s": 1.0})).verdict[1]
+    line = noack.simulate(noack.load(name, {"horizon_s": 1.0})).verdict[-2]
     assert line.tone == (Tone.GOOD if is_certified else Tone.DOUBTFUL)
     if not is_certified:
         assert line.text == f"guarantee not checkable: {answer.text}"
@@ -59,6 +59,8 @@ def test_a_played_pattern_is_long_enough_to_show_its_growth(tmp_path: Path) -> N
     assert loop.initial_state_norm is not None
     assert loop.final_state_norm is not None
     assert loop.final_state_norm >= GROWN * loop.initial_state_norm
-    assert "‖x‖ grew from" in run.verdict[0].text
+    assert "‖x‖ grew from" in run.verdict[1].text
+    outputs = run.verdict[0]
+    assert (outputs.text.partition(" was at most ")[0], outputs.tone) == ("lateral offset", Tone.DOUBTFUL)
     expected = f"in {played.scenario.horizon_s:g} s ‖x‖ goes from 3.04 to {loop.final_state_norm:.3g}"
     assert played.expected == f"expected, as in virtual time: {expected}"

@@ -21,7 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from itertools import count, islice
 from pathlib import Path
 
-from tests.fuzz.scenarios.check_draw import LIMIT_S, Checked, Contradiction, check_draw
+from tests.fuzz.scenarios.check_draw import LIMIT_S, TOO_LONG, Checked, Contradiction, check_draw
 from tests.fuzz.scenarios.draws import NEVER_DRAWN, draw, schema_keys
 
 _MOST_SHOWN = 12
@@ -46,6 +46,9 @@ class Totals:
         self.keys |= checked.keys
         self.refused += checked.is_refused
         self.refusals.update(map(_without_numbers, checked.refusals.elements()))
+        for name in checked.counts:
+            if name.endswith(TOO_LONG):
+                print(f"draw {checked.number} of seed {checked.seed}: {name}", flush=True)
         if not checked.contradictions:
             return
         self.contradictory.add(checked.number)

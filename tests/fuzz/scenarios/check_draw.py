@@ -2,7 +2,7 @@
 
 A mistake of noack is a *contradiction*: a traceback, a message of several lines, a replay that
 differs, a claim or bound that is violated, or a step that takes too long. A draw may be refused, with
-one line.
+one line. A search, as of a proof, may end without a result; one that takes too long is counted.
 """
 
 import contextlib
@@ -50,6 +50,8 @@ _MOST_FINDINGS = 5
 """Findings of a run that the model does not explain that are listed."""
 _MOST_ENTRIES = 2
 """Entries of [[loops]] whose loop is certified and attacked."""
+TOO_LONG = ": search too long"
+"""What the count of searches that reach their limit ends with, after the name of the step."""
 _MOST_LETTERS = 700
 """Longest message of a refusal."""
 
@@ -95,8 +97,11 @@ class Checks:
         self.contradictions.append(Contradiction(self.drawn.seed, self.drawn.number, step, what, detail))
 
     @contextlib.contextmanager
-    def step(self, name: str, *, may_refuse: bool = True) -> Iterator[None]:
-        """Do a step, with a limit of its CPU time; any exception but a refusal is a contradiction."""
+    def step(self, name: str, *, may_refuse: bool = True, searches: bool = False) -> Iterator[None]:
+        """Do a step, with a limit of its CPU time; any exception but a refusal is a contradiction.
+
+        A step that ``searches`` may reach the limit, which is counted.
+        """
         try:
             with _limited(self.limit_s), warnings.catch_warnings(action="error"):
                 warnings.filterwarnings("default", category=DeprecationWarning)
@@ -110,6 +115,9 @@ class Checks:
             elif fault := fault_of_message(str(error)):
                 self.add(name, f"{fault}: {error}")
         except TooLongError:
+            if searches:
+                self.counts[f"{name}{TOO_LONG}"] += 1
+                return
             self.add(name, f"more than {self.limit_s:g} s of CPU time", traceback.format_exc(limit=-6))
         except Exception as error:
             self.add(name, f"{type(error).__name__}: {error}", traceback.format_exc(limit=-6))
@@ -153,7 +161,7 @@ class Checks:
     def evaluate(self, ending: RunEnding) -> None:
         """Write the summary of a run, with the verdicts of its claims."""
         warned = io.StringIO()
-        with self.step("finalize", may_refuse=False), contextlib.redirect_stderr(warned):
+        with self.step("finalize", may_refuse=False, searches=True), contextlib.redirect_stderr(warned):
             summary = finalize(ending, report=False, view=False).summary
             if warned.getvalue():
                 self.add("finalize", warned.getvalue())
@@ -168,7 +176,7 @@ class Checks:
 
     def certify(self, loop: Scenario) -> None:
         """Certify a loop under both conditions."""
-        with self.step("certify"):
+        with self.step("certify", searches=True):
             results = certificates_of(loop)
             json.dumps([certificate.to_json() for _, certificate in results], allow_nan=False)
             self.counts["certified"] += results.answer.is_certified
@@ -184,12 +192,12 @@ class Checks:
         self, resolved: Scenario, *, continuous: bool, certificate: ScenarioCertificate | None = None
     ) -> None:
         if certificate is None:
-            with self.step("certificate to attack"):
+            with self.step("certificate to attack", searches=True):
                 certificate = quick_certificate(resolved, ideal=continuous)
         for objective in (Objective.ERROR, Objective.STATE, Objective.INTER_EVENT):
             if certificate is None:
                 return
-            with self.step("attack"):
+            with self.step("attack", searches=True):
                 worst = find_worst(
                     resolved, objective, continuous=continuous, most_nodes=_NODES, beam=_BEAM,
                     certificate=certificate,
@@ -206,7 +214,7 @@ class Checks:
         resolved = resolve(loop)
         for conditions in ("schedule", "ideal"):
             proof = None
-            with self.step(f"prove, {conditions}"):
+            with self.step(f"prove, {conditions}", searches=True):
                 plants = plants_of(resolved)[0]
                 statement = find_statement(resolved, plants, conditions)
                 proof = statement.proof

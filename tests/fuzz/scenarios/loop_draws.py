@@ -253,6 +253,7 @@ def _model(of: Chances) -> tuple[Table, Model]:
     else:
         table |= {key: matrix.tolist() for key, matrix in matrices.items()}
     of.put(table, 0.2, "state_names", lambda: [f"state {index}" for index in range(model.n)])
+    of.put(table, 0.1, "state_units", lambda: ["rad", *[""] * (model.n - 1)])
     of.put(table, 0.2, "input_names", lambda: [f"input {index}" for index in range(model.m)])
     if of.chance(0.03):
         table["allow_unstable"] = True

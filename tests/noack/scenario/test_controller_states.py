@@ -43,6 +43,14 @@ def test_a_resolved_scenario_has_the_states_of_the_controller() -> None:
     assert [output.name for output in loop.outputs] == ["angle", "rate"]
 
 
+def test_only_the_loop_with_the_controller_has_to_be_stable() -> None:
+    """Â + B̂K is not stable, but D replaces K; u = Kx alone is another loop."""
+    replaced = {"model.gain": [[6.0, 1.2]], "controller.D": K.tolist()}
+    assert np.array_equal(loop_of(resolve(noack.load(LOOP, replaced))).K, [[-6.0, -1.2, -8.0]])
+    with pytest.raises(noack.NoackError, match=r"model.gain = \[\[6.0, 1.2\]\]: u = K x does not stabilise"):
+        noack.load({**LOOP, "controller": {}}, {"model.gain": [[6.0, 1.2]]})
+
+
 def test_the_loop_without_losses_is_that_of_scipy() -> None:
     """With a small threshold the loop is nearly the continuous one of plant and controller."""
     settings = {"network.loss": {"model": "lossless"}, "trigger.beta": 1e-6, "trigger.floor": 1e-6}

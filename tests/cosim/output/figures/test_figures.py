@@ -129,9 +129,9 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> No
 def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: Path) -> None:
     run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}))
     names = {path.stem for path in run.save_figures("svg")}
-    assert names == {"errors", "input", "inter-event", "losses", "state-norm", "states"}
+    assert names == {"errors", "input", "inter-event", "losses", "outputs", "state-norm", "states"}
     assert [path.name for path in run.save_figures("png", figure="losses")] == ["losses.png"]
-    with pytest.raises(CallerError, match='"loss": no such figure of this run; it has states, '):
+    with pytest.raises(CallerError, match='"loss": no such figure of this run; it has outputs, states, '):
         run.save_figures("png", figure="loss")
     with pytest.raises(CallerError, match="format eps: 'eps' is not one of 'svg', 'png', 'pdf'"):
         run.save_figures("eps")
