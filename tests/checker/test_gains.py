@@ -15,7 +15,7 @@ from noack.theory.witnesses.effort import NoWitnessError
 from noack.theory.witnesses.gains import _lyapunov
 from noack_check.balls import beside, identity, matrix, number, zeros
 from noack_check.check import RejectedError
-from noack_check.loop import Loop, Times
+from noack_check.loop import Loop, Memory, Times
 from noack_check.proof import Proof, prove
 from noack_check.responses import Decay, responses, responses_until
 from noack_check.scenario import _squares
@@ -209,7 +209,7 @@ def test_what_is_not_covered_is_rejected() -> None:
     loop = double_integrator()
     document = by_gains(loop)[0]
     with pytest.raises(RejectedError, match=r"^gains: "):
-        prove(loop._replace(loads=1), document)
+        prove(loop._replace(rule=loop.rule._replace(memory=Memory(arb(1), identity(4), arb(0)))), document)
 
 
 # Rules with terms of x and e_s.

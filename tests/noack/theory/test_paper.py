@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from noack.theory.bounds.enclosure import response
 from scipy.linalg import expm
 from tests.noack.theory.certificates.certificate_kinds.policies import INSTANT
 from tests.noack.theory.certificates.certified_loops import certified_or_skipped
@@ -24,6 +23,7 @@ from noack.theory.paper import (
     theorem_1,
     theorem_2,
 )
+from noack.theory.response_bounds import bound_response
 from noack.trigger_policies.trigger_rule import TriggerRule
 from tests.helpers.example_rules import decaying_rule
 from tests.helpers.shipped import resolved
@@ -130,7 +130,7 @@ def test_no_other_rate_gives_theorem_2_a_longer_inter_event_time(name: str) -> N
     closed, best = loop.A + loop.B @ loop.K, theorem_2(loop, beta, alpha, delta)
     assert best is not None
     for rate in alpha + np.linspace(0.05, 0.95, 10) * (-spectral_abscissa(closed) - alpha):
-        c = response(closed + rate * np.eye(loop.n), np.eye(loop.n)).through(np.eye(loop.n)).sup()
+        c = bound_response(closed + rate * np.eye(loop.n), np.eye(loop.n), np.eye(loop.n)).largest
         other = _theorem_2(loop, beta, alpha, delta, rate, float(c))
         assert other.inter_event_s <= 1.001 * best.inter_event_s
 
