@@ -33,7 +33,7 @@ gc.disable()  # until everything is loaded, of which nothing is garbage
 FIRST = (
     "tests/native/test_sanitized.py", "tests/test_doc_programs.py",
     "tests/integration/", "tests/native/", "tests/cosim/simulation/test_whole_loop.py", "tests/test_docs.py",
-    "tests/noack/theory/certificates/test_certificate_kinds.py", "tests/attacks/", "tests/cosim/",
+    "tests/attacks/", "tests/cosim/",
     "tests/netem/", "tests/noack/plants/", "tests/noack/theory/",
 )  # fmt: skip
 """What takes longest, in this order: a worker runs whole files, and none should end alone."""

@@ -5,15 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
-from tests.noack.theory.certificates.certificate_kinds.policies import INSTANT
-from tests.noack.theory.certificates.certified_loops import certified_or_skipped
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.scenario.resolution import LoopMatrices, loop_of
-from noack.theory.certificates.conditions import NetworkConditions
 from noack.theory.paper import (
     ErrorMonitor,
     InterEventTrajectory,
@@ -35,6 +32,9 @@ def norm(matrix: Matrix) -> float:
     return float(np.linalg.norm(matrix, 2))
 
 
+INSTANT = {"delay_steps": 0, "hold_steps": 0, "known_start": True, "window": (1, 1), "recovery": 0}
+
+
 def of(system: System) -> tuple[LoopMatrices, Theorem2]:
     """Theorem 2 with the uniform Δ from (I1)."""
     names = tuple(f"x_{i}" for i in range(len(system.A)))
@@ -43,7 +43,9 @@ def of(system: System) -> tuple[LoopMatrices, Theorem2]:
         A=system.A, B=system.B, x0=system.x0, weight=None,
         state_names=names, input_names=names[: len(system.K)],
     )  # fmt: skip
-    delta = certified_or_skipped(system, NetworkConditions(system.mansd)).delta
+    growing, identity = system.H + system.alpha * np.eye(loop.n), np.eye(loop.n)
+    assume(spectral_abscissa(growing) < 0)
+    delta = 1 + system.mansd * bound_response(growing, identity, identity).largest
     paper = theorem_2(loop, system.beta, system.alpha, delta)
     assert paper is not None
     return loop, paper
