@@ -123,7 +123,7 @@ def test_theorem_1_agrees_with_a_hand_calculation() -> None:
         assert theorem_1(H, 0.7, delays_s) == pytest.approx(expected, rel=1e-5)
     assert theorem_1(-np.eye(1), 0.7, []) == 1.0
     growing = theorem_1(np.eye(1), 0.7, [0.5])
-    assert growing == pytest.approx(1 + math.exp(0.35) * math.exp(0.5), rel=1e-4)
+    assert growing == pytest.approx(1 + math.exp(0.35) * math.exp(0.5), rel=2e-3)
 
 
 @pytest.mark.parametrize("name", ["f16_lateral", "reactor_petc"])
