@@ -19,6 +19,12 @@ event needs zᵀQz > θ². So a silent test leaves c = ‖Y(e_s − n + J(x + n)
 bound is convex in f₁ from 0 to 1. So c ≤ c₁f₁ + c₂f₂ if it is so at both ends: c₂ ≥ √(θ₂² + s₂²) and
 c₁ + c₂ ≥ √(max(θ₁, θ₂)² + (s₁ + s₂)²). In a single unit c ≤ √(θ² + s²).
 
+*Other rules* are followed as if they were one of these. If events are at most some time apart, as with a
+deadline, the rule may be taken for a periodic one of this period. A rule that needs ∫ ‖W(e_s − n)‖ dt > a
+may be taken for ‖W(e_s − n)‖ > a/T, for any T, with T for h: in the last T there was an event, or a time at
+which ‖W(e_s − n)‖ ≤ a/T, and no event after it. If tests are h' to h apart, the trapezoids of k of them give
+a/(kh') for a/T, and (k + 1)h for h.
+
 *After a test* e_s = Y⁻¹y − J(x + n) + n with ‖y‖ ≤ c, or e_s = n if it was an event. So |C e^{Hs} e_s| is
 at most the sum b(s) of the bounds of these three parts. The next test is at most h later. With a dwell time
 h is the time from an event on in which none is tested. For a periodic rule, which compares nothing, it is
@@ -58,12 +64,12 @@ they do not: see :mod:`.proof`.
 from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from flint import arb, arb_mat
+from flint import arb, arb_mat, fmpq
 
 from noack_check.balls import beside, columns_of, identity, is_positive, is_zero, rows_of, square, upto, zeros
 from noack_check.check import RejectedError
-from noack_check.document import read_matrix, read_number, read_rows, read_table
-from noack_check.loop import Loop
+from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
+from noack_check.loop import Loop, Rule
 from noack_check.model import thresholds
 from noack_check.noise import noise_of
 from noack_check.responses import Decay, Response, norm_of, responses, responses_until, upper
@@ -72,6 +78,8 @@ Form = Mapping[str, arb]
 """Σ coefficient · signal, by the signals' names; "1" is the constant 1."""
 _ROOM = 1e-9
 """By so much, relatively, y exceeds the solution of y = Fy + g."""
+_MOST_TESTS = 1_000_000
+"""Over which an integral is averaged."""
 _CHORDS, _BETTER = 8, 0.999
 """Chords of √(θ² + s²) that are tried, while they are less steep by this factor."""
 
@@ -175,6 +183,35 @@ def _comparison(loop: Loop, table: Mapping[str, object]) -> Comparison | None:
     if not is_positive(Q - square(found.errors * beside(found.shift, identity(n)))):
         raise RejectedError("gains: comparison: a silent test does not say as much")
     return found
+
+
+def _followed(loop: Loop, table: Mapping[str, object]) -> Loop:
+    """Return the loop with the rule for which that of a loop is taken, as a document's table says."""
+    n, rule, times = loop.n, loop.rule, loop.times
+    if table.get("by_time", False):
+        if not times.longest > 0:
+            raise RejectedError("gains: by_time: the rule has no largest time between events")
+        none = zeros(0, 2 * n)
+        least = max(times.least_apart, min(times.longest, fmpq(1, 10**9)))
+        return loop._replace(
+            rule=Rule(none, none, arb(0), arb(0), arb(0)),
+            times=times._replace(
+                least_period=min(least, times.longest), period=times.longest, dwell=fmpq(0), longest=fmpq(0)
+            ),
+        )
+    if not rule.integrates:
+        return loop
+    if times.sampling > 0:
+        tests = read_count(table, "tests", _MOST_TESTS)
+        least, window = tests * times.least_sampling, (tests + 1) * times.sampling
+    else:
+        least = window = read_number(table, "window_s").fmpq()
+    if not least > 0:
+        raise RejectedError("gains: tests or window_s: not above 0")
+    return loop._replace(
+        rule=rule._replace(floor=rule.floor / arb(least), integrates=False),
+        times=times._replace(sampling=window, least_sampling=fmpq(0)),
+    )
 
 
 class UnitGains:
@@ -453,6 +490,7 @@ class Gains:
     """
 
     def __init__(self, loop: Loop, rate: arb, table: Mapping[str, object]) -> None:
+        loop = _followed(loop, table)
         require_covered(loop)
         self.loop, self.rate, witness = loop, rate, read_witness(loop, table)
         witness.plant.require(loop.A + loop.B * loop.gain + rate * identity(loop.n), "gains: plant")

@@ -373,8 +373,12 @@ def test_the_keys_that_the_table_calls_used_are_those_that_are_read() -> None:
     identity = "plant.measurement.C=[[1.0, 0.0], [0.0, 1.0]]"
     box = ("plant.uncertainty_A=[[0.1, 0.0], [0.0, 0.0]]", "plant.uncertainty_B=[[0.0], [0.25]]")
     forecast = "growth_per_s=1, mismatch_per_s=1, shortest_s=0.1, longest_s=0.5"
-    self_triggered = f'policy="self_triggered", beta=0.1, alpha_per_s=0.2, {forecast}'
-    for trigger in (*TRIGGERS, 'policy="decaying", beta=0.1, alpha_per_s=0.2', self_triggered):
+    others = (
+        f'policy="self_triggered", beta=0.1, alpha_per_s=0.2, {forecast}',
+        'policy="decaying", beta=0.1, alpha_per_s=0.2',
+        'policy="send_on_area", delta_s=0.1',
+    )
+    for trigger in (*TRIGGERS, *others):
         settings = (f"trigger={{{trigger}}}", constraint, identity, DISTURBANCES, *box)
         tables = resolved_tables("double_integrator", *settings, "plant.watchdog.policy=zero")
         read_loop(Recorded(tables, read), box=True, ideal=False)
