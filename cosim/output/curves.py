@@ -139,9 +139,9 @@ def error_curves(t_s: Vector, e_s: Vector, e_c: Vector, threshold: Vector | None
     return curves
 
 
-def norm_curve(t_s: Vector, norm: Vector) -> Curve:
-    """Return ‖x‖, (k,)."""
-    return Curve(STATE_NORM, "‖x‖ plant", "", t_s, norm, CurveStyle(PLANT, 2.4))
+def norm_curve(t_s: Vector, norm: Vector, name: str = "‖x‖") -> Curve:
+    """Return ‖x‖, or the norm of that name, (k,)."""
+    return Curve(STATE_NORM, f"{name} plant", "", t_s, norm, CurveStyle(PLANT, 2.4))
 
 
 def input_curves(names: Sequence[str], t_s: Vector, u: Matrix) -> list[Curve]:

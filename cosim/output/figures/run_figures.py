@@ -55,7 +55,7 @@ from cosim.output.figures.timing_figures import (
 from cosim.record.align import AlignedRun, Reals, aligned_parts
 from cosim.record.decimation import decimate_all
 from cosim.record.run_events import packet_outcomes, reference_in_run
-from cosim.record.run_record import RunRecord
+from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.row_operations import row_norms
 from noack.guarantee.loss_guarantee import LossesInWindow
@@ -139,7 +139,7 @@ def run_curves(record: RunRecord) -> list[Curve]:
         *_states_of(record, samples),
         *(curve for output in _stated_outputs(record) for curve in _output_curves(record, output)),
         *_errors_of(samples.run),
-        norm_curve(*_decimated(record, PLANT_STEP, "x", row_norms)),
+        _norm_of(record),
         *input_curves(record.loop.input_names, *_decimated(record, CONTROLLER_STEP, "u")),
         *transmission_curves(_seconds(events["t_ns"]), delivered),
         *bound_curves(envelopes(record)),
@@ -187,12 +187,13 @@ def _from_first_update(run: AlignedRun, record: RunRecord) -> AlignedRun:
 
 @np.errstate(all="ignore")  # a run may diverge
 def _decimated(
-    record: RunRecord, table: str, column: str, curves: Callable[[Reals], Reals] = np.asarray
+    record: RunRecord, table: str, column: str, curves: Callable[[Rows], Reals] | None = None
 ) -> tuple[Reals, Reals]:
-    """Return times in s (k,) and curves of a vector column (k, …), reduced like the samples."""
-    t_s, values = [np.zeros(0)], [curves(np.zeros((0, *record.tables[table][column].shape)))]
+    """Return times in s (k,) and a vector column, or curves of it, (k, …), reduced like the samples."""
+    taken = (lambda rows: np.asarray(rows[column])) if curves is None else curves
+    t_s, values = [np.zeros(0)], [taken(np.zeros(0, record.tables[table]))]
     for rows in record.batches(table, ("t_ns", column)):
-        part_s, part = _seconds(rows["t_ns"]), curves(rows[column])
+        part_s, part = _seconds(rows["t_ns"]), taken(rows)
         keep = decimate_all(part_s, part.reshape(len(part), -1), record.slice_columns)
         t_s.append(part_s[keep])
         values.append(part[keep])
@@ -424,14 +425,32 @@ def _errors(scenario: Scenario, run: AlignedRun, bounds: list[Curve]) -> PageFig
     )
 
 
+def _norm_of(record: RunRecord) -> Curve:
+    """Return ‖x‖ over the steps of the plant; with a reference or loads the distance that is bounded."""
+    reference, rest = reference_in_run(record), record.loop.rest
+
+    def distances(rows: Rows) -> Reals:
+        if reference is not None:
+            return row_norms(rows["x"] - reference.states(rows["t_ns"]))
+        return row_norms(rows["x"] - rest if rest.any() else rows["x"])
+
+    name = "‖x‖" if reference is None and not rest.any() else "‖x − x_r‖"
+    return norm_curve(*_decimated(record, PLANT_STEP, "x", distances), name)
+
+
 def _state_norm(record: RunRecord, bounds: list[Curve]) -> PageFigure:
-    t_s, norm = _decimated(record, PLANT_STEP, "x", row_norms)
-    ends = f", from {norm[0]:.3g} to {norm[-1]:.3g}" if len(norm) else ""
+    curve = _norm_of(record)
+    ends = f", from {curve.values[0]:.3g} to {curve.values[-1]:.3g}" if len(curve.t_s) else ""
+    name = "Norm of the plant's state"
+    if reference_in_run(record) is not None:
+        name += " from its reference"
+    elif record.loop.rest.any():
+        name += " from its rest under the load"
     return one_panel(
         "state-norm",
         2.1,
-        lambda axes: draw_norms(axes, "Norm of the state", [norm_curve(t_s, norm)], bounds),
-        caption="Norm of the plant's state." + _dashed(bounds),
+        lambda axes: draw_norms(axes, "Norm of the state", [curve], bounds),
+        caption=f"{name}." + _dashed(bounds),
         description=f"Norm of the state over time on a logarithmic axis{ends}.",
     )
 

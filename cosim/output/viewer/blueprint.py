@@ -191,7 +191,11 @@ def _styles(layout: LoopLayout) -> dict[str, Static]:
         ERROR: rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4]),
         ERROR_LOG10: rr.SeriesLines(names=errors, colors=colours, widths=widths),
         SIZE_LOG10: rr.SeriesLines(
-            names=["certified from x(0)", "bound, given x at the last event", "‖x‖ plant"],
+            names=[
+                "certified from x(0)",
+                "bound, given x at the last event",
+                "‖x‖ plant" if layout.reference is None else "‖x − x_r‖ plant",
+            ],
             colors=[CERTIFIED, CERTIFIED, PLANT],
             widths=[2.0, 1.0, 2.5],
         ),

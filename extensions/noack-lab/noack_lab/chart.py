@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import noack
-from noack_lab.results import ShownRun
+from noack_lab.results import NORM, ShownRun
 
 Json = dict[str, Any]
 
@@ -20,6 +20,8 @@ _DECADES = 7
 _HEAD, _PLOT, _GAP, _FOOT = 48, 120, 12, 40
 """Heights in pixels: title and legend of a panel, its axes, the space below them, the last axis."""
 _LEFT, _RIGHT, _TOOLS = 62, 14, 84
+_OUTPUT = "output "
+"""What the name of the panel of an output's distance begins with."""
 
 
 class Drawn(NamedTuple):
@@ -58,7 +60,10 @@ def chart_options(drawn: Drawn) -> Json:
         },
         "title": [], "legend": [], "grid": [], "xAxis": [], "yAxis": [], "series": [],
     }  # fmt: skip
-    for number, (title, curves) in enumerate(panels.items()):
+    target = " − r" if any(curve.name == "x_r reference" for curve in drawn.run.curves) else ""
+    for number, (panel, curves) in enumerate(panels.items()):
+        output = panel.removeprefix(_OUTPUT)
+        title = panel if output == panel else f"|{output}{target}|"
         top, is_last = number * (_HEAD + _PLOT + _GAP), number == len(panels) - 1
         unit = next((f" [{curve.unit}]" for curve in curves if curve.unit), "")
         scale = " (logarithmic)" if curves[0].is_logarithmic else ""
@@ -107,7 +112,8 @@ def _panels(drawn: Drawn) -> dict[str, list[noack.Curve]]:
     panels: dict[str, list[noack.Curve]] = {}
     if drawn.reference is not None:
         for curve in drawn.reference.curves:
-            if curve.name in ("x plant", "‖e_c‖ controller", "‖x‖ plant"):
+            is_norm = curve.panel == NORM and curve.name.endswith(" plant")
+            if is_norm or curve.name in ("x plant", "‖e_c‖ controller"):
                 style = noack.CurveStyle(_GREY, 1.2, (4, 3))
                 faint = noack.Curve(curve.panel, REFERENCE, curve.unit, curve.t_s, curve.values, style)
                 panels.setdefault(curve.panel, []).append(faint)

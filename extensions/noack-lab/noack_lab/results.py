@@ -71,7 +71,9 @@ class ShownRun:
     @property
     def facts(self) -> list[Fact]:
         """The key numbers."""
-        arrived, norm, e_c = self.transmissions, self.values("‖x‖ plant"), self.values("‖e_c‖ controller")
+        arrived, e_c = self.transmissions, self.values("‖e_c‖ controller")
+        name = next((curve.name for curve in self.curves if curve.panel == NORM), "")
+        norm, norm_name = self.values(name), name.removesuffix(" plant")
         lost = int(np.sum(~arrived))
         share = f" ({100 * lost / len(arrived):.0f} %)" if len(arrived) else ""
         bursts = np.diff(np.flatnonzero(np.concatenate([[True], arrived, [True]]))) - 1
@@ -81,7 +83,10 @@ class ShownRun:
             Fact("longest loss burst", str(int(bursts.max(initial=0)))),
         ]
         if len(norm):
-            facts += [Fact("‖x‖ at the start", _number(norm[0])), Fact("‖x‖ at the end", _number(norm[-1]))]
+            facts += [
+                Fact(f"{norm_name} at the start", _number(norm[0])),
+                Fact(f"{norm_name} at the end", _number(norm[-1])),
+            ]
         return [*facts, *([Fact("largest ‖e_c‖", _number(e_c.max()))] if len(e_c) else [])]
 
 
@@ -106,7 +111,7 @@ def run_of(scenario: noack.Scenario) -> ShownRun:
     except noack.NoackError as error:
         if scenario.loops:
             raise CallerError("a scenario of several loops: run it live") from None
-        note = str(error)
+        note = f"in virtual time, not in continuous time: {error}"
     run = noack.simulate(scenario)
     curves = [curve for curve in run.curves() if curve.style.colour != _GREEN]  # bounds come later
     return ShownRun(SIMULATED, curves, _lines(run), note)
@@ -137,7 +142,10 @@ def guarantee_of(scenario: noack.Scenario) -> Guarantee:
     style = noack.CurveStyle(_GREEN, 1.6, _DASHED)
     with np.errstate(all="ignore"):
         bounds = [(ERRORS, certificate.controller_error(t_s)), (NORM, certificate.state(t_s))]
+        of_outputs = certificates.output_bounds(certificate) if scenario.outputs else []
+        bounds += [(of_each.output.distance, of_each.certificate.state(t_s)) for of_each in of_outputs]
     facts = [
+        *(Fact(each.output.name, each.statement.removeprefix(f"{each.output.name} ")) for each in of_outputs),
         Fact("minimum inter-event time", f"{_number(1e3 * (certificate.inter_event_s or 0.0))} ms"),
         Fact("decay rate of the bounds", f"{_number(constants.rate_per_s)} /s"),
         Fact("Δ of ‖e_c‖ ≤ Δ · threshold", _number(constants.delta)),
