@@ -22,6 +22,7 @@ _POINTS = 121
 """Times at which certified bounds are drawn."""
 _GREEN, _DASHED = (51, 162, 78), (6.0, 2.5)
 _MARGIN_ACCURACY = 1e-3
+_CONTINUOUS = "in continuous time: "
 
 
 class VerdictText(NamedTuple):
@@ -111,7 +112,7 @@ def run_of(scenario: noack.Scenario) -> ShownRun:
     except noack.NoackError as error:
         if scenario.loops:
             raise CallerError("a scenario of several loops: run it live") from None
-        note = f"in virtual time, not in continuous time: {error}"
+        note = f"in virtual time; an exact run is not possible: {str(error).removeprefix(_CONTINUOUS)}"
     run = noack.simulate(scenario)
     curves = [curve for curve in run.curves() if curve.style.colour != _GREEN]  # bounds come later
     return ShownRun(SIMULATED, curves, _lines(run), note)
