@@ -61,7 +61,22 @@ def test_a_plant_that_is_not_linear_is_simulated_in_virtual_time_with_the_reason
     run = noack_lab.explore("dc_motor", {"horizon_s": 0.2}).run
     assert run.kind == results.SIMULATED
     assert "not given by matrices" in run.note
-    assert len(run.verdict) == 3
+    assert run.note.startswith("in virtual time; an exact run is not possible: ")
+    assert run.verdict[0].text.startswith("shaft_angle was ")
+
+
+def test_distances_from_a_reference_are_drawn_with_the_bounds_about_it() -> None:
+    explorer = noack_lab.explore("servo_reference", {"horizon_s": 6.0})
+    bounds = {curve.panel: curve for curve in explorer.certificate.curves}
+    for name in ("‖x − x_r‖ plant", "angle"):
+        (curve,) = (curve for curve in explorer.run.curves if curve.name == name)
+        bound = bounds[curve.panel]
+        assert np.all(curve.values <= np.interp(curve.t_s, bound.t_s, bound.values) * 1.001)
+        assert curve.values[-1] < 0.02  # the angle itself is at 1.5 then
+    facts = dict(explorer.certificate.facts)
+    assert facts["angle"].startswith("stays within 0.15 rad of its reference from ")
+    titles = [title["text"] for title in chart_options(Drawn(explorer.run, ""))["title"]]
+    assert "|angle − r| [rad] (logarithmic)" in titles
 
 
 def test_a_recorded_run_has_its_loops_and_its_bounds(tmp_path: Path) -> None:
