@@ -93,13 +93,16 @@ def test_the_chart_has_a_panel_for_each_quantity_and_is_json() -> None:
     run, before = explorer.run, noack_lab.explore("lane_following", {"horizon_s": 2.0}).run
     options = chart_options(Drawn(run, "psi", explorer.certificate.curves, before))
     titles = [title["text"].split(" (")[0] for title in options["title"]]
-    assert titles == ["psi", "error norms", "norm of the state", "inter-event time [s]"]
+    assert titles == [
+        "psi", "|lateral offset| [m]", "|heading| [rad]", "error norms", "norm of the state",
+        "inter-event time [s]",
+    ]  # fmt: skip
     assert json.loads(json.dumps(options, allow_nan=False))["xAxis"][0]["max"] == 4.0
     series = {(part["name"], part["yAxisIndex"]): part for part in options["series"]}
-    drawn = np.array(series["‖x‖ plant", 2]["data"], float)
+    drawn = np.array(series["‖x‖ plant", 4]["data"], float)
     (curve,) = [curve for curve in run.curves if curve.name == "‖x‖ plant"]
     np.testing.assert_allclose(drawn, np.column_stack([curve.t_s, curve.values]), rtol=1e-5)
-    assert {("for comparison", 0), ("for comparison", 2), ("certified bound (computed)", 1)} <= {*series}
-    assert options["yAxis"][1]["type"] == "log"
-    reached = [value for _, value in series["‖e_s‖ sensor", 1]["data"] if value is not None]
+    assert {("for comparison", 0), ("for comparison", 4), ("certified bound (computed)", 3)} <= {*series}
+    assert options["yAxis"][3]["type"] == "log"
+    reached = [value for _, value in series["‖e_s‖ sensor", 3]["data"] if value is not None]
     assert min(reached) > 0  # it is 0 after a reset, which is a gap
