@@ -41,15 +41,16 @@ M − 1. Go back from σ to the test before it, and from each lost event to the 
 
 with g and g' the suprema of b(s) up to h + d, and for ever, and k that of ‖C e^{Hs} W⁻¹‖ for ever. The sums
 are over the columns q of B, D, and of the identity for ω and Ex, with the suprema |q̂| of p, d, ω and Ex. The
-integrals are over times that do not overlap, so p before the first input adds at most t_a sup |C e^{Hs} q|
-|q̂|. Neither times between events nor numbers of updates on their way are assumed. With a periodic rule
-t − t_r ≤ Mh + d: v is followed from t_r, and nothing is counted as lost.
+integrals are over times that do not overlap. So what p exceeds |p̂| by before the first input adds at most
+t_a sup |C e^{Hs} q| times this. Neither times between events nor numbers of updates on their way are assumed.
+With a periodic rule t − t_r ≤ Mh + d: v is followed from t_r, and nothing is counted as lost.
 
 *The input* is K e^{−Hs} x_c of an age s ≤ a: p = K e^{−Hs} e_c − ∫₀ˢ K e^{−Hτ} H x dτ. With a ball C around
 K e^{−Hs} for all ages, |p_j| ≤ |C_j e_c| + a |C_j H x|.
 
-*The state.* |Cx| ≤ sup |C e^{(A+BK)s} x(0)| + Σ_q ∫ |C e^{(A+BK)s} q| ds · |q̂|. What acts up to t_a only
-adds at most t_a sup |C e^{(A+BK)s} q| |q̂|: p = −Kx, of which x = e^{At} x(0) + … gives a bound.
+*The state.* |Cx| ≤ sup |C e^{(A+BK)s} x(0)| + Σ_q ∫ |C e^{(A+BK)s} q| ds · |q̂|. By what p exceeds |p̂|
+before the first input, it adds at most t_a sup |C e^{(A+BK)s} q| times this: there p = −Kx, of which
+x = e^{At} x(0) + … gives a bound.
 
 *Conclusion.* For each signal these are inequalities v_i(t) ≤ (T v)(t) + g_i(t) with a positive linear T of
 the past, which maps y₁f₁ + y₂f₂ to at most F₁y₁ f₁ + F₂y₂ f₂. The solution has y > Fy + g in both units, and
@@ -117,7 +118,7 @@ class Source(NamedTuple):
     column: arb_mat
     of_state: Form
     of_error: Form
-    early: Form  # in both, up to the first input
+    early: Form  # in both, beside these, up to the first input
     is_outside: bool = False  # acts before the first input, too, beside p
 
 
@@ -305,7 +306,7 @@ class UnitGains:
         n, B = loop.n, loop.B * self._inputs
         for j in range(B.ncols()):
             amplitude = {f"p {j}": one}
-            yield Source(columns_of(B, [j]), amplitude, amplitude, {f"p before {j}": one})
+            yield Source(columns_of(B, [j]), amplitude, amplitude, {f"p more {j}": one})
         for i in self._boxed:
             amplitude = {f"box {i}": one}
             yield Source(columns_of(identity(n), [i]), amplitude, amplitude, {}, is_outside=True)
@@ -393,6 +394,8 @@ class UnitGains:
             terms = [(response.total, source.of_error) for response, source in pairs if source.is_outside]
             terms += [(before[-1].most, {"1": one})] if self.unit.has_start else []
             yield f"p before {j}", _sum(*terms)
+            yield f"p more {j}", {}
+            yield f"p more {j}", {f"p before {j}": one, f"p {j}": -one}
         for i in self._boxed:
             terms = [(loop.half_A[i, j], self.state(f"x[{j}]")) for j in range(loop.n)]
             terms += [(loop.half_B[i, j], self.input(j)) for j in range(loop.B.ncols())]
@@ -451,7 +454,7 @@ def _sum(*terms: tuple[arb, Form]) -> Form:
 
 def value(form: Form, sups: Mapping[str, arb]) -> arb:
     """Return the value of a form, rounded up."""
-    return upper(sum((size * sups[name] for name, size in form.items()), arb(0)))
+    return upper(sum((size * sups[name] for name, size in form.items()), arb(0)).max(arb(0)))
 
 
 def _solved(rows: Mapping[str, Form]) -> dict[str, arb]:

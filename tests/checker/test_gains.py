@@ -292,6 +292,13 @@ def test_a_threshold_and_a_share_of_x_do_not_add_up() -> None:
     assert found["e_s"] == pytest.approx(math.hypot(0.1, 0.1 * found["x"]), rel=1e-3)
 
 
+def test_a_bound_of_the_input_error_that_holds_at_all_times_counts_alone() -> None:
+    """If p = −Kx before the first input is below what p is at most later, this time changes nothing of x."""
+    loop = scalar(2, SCHEDULE, level=0.0, floor=1.0)._replace(start=number(0.01) * identity(1))
+    later, at_once = (sizes(by_gains(each)[1])["x"] for each in (changed(loop, start=fmpq(1, 5)), loop))
+    assert later == pytest.approx(at_once, rel=1e-2)
+
+
 # Rules that are taken for others.
 
 DISTURBED = scalar(0, SCHEDULE)._replace(pushes=identity(1), sizes=(number(0.1),))
