@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import noack
-from noack_lab.results import NORM, ShownRun
+from noack_lab.results import NORM, ShownRun, panel_title
 
 Json = dict[str, Any]
 
@@ -20,8 +20,6 @@ _DECADES = 7
 _HEAD, _PLOT, _GAP, _FOOT = 48, 120, 12, 40
 """Heights in pixels: title and legend of a panel, its axes, the space below them, the last axis."""
 _LEFT, _RIGHT, _TOOLS = 62, 14, 84
-_OUTPUT = "output "
-"""What the name of the panel of an output's distance begins with."""
 
 
 class Drawn(NamedTuple):
@@ -60,10 +58,8 @@ def chart_options(drawn: Drawn) -> Json:
         },
         "title": [], "legend": [], "grid": [], "xAxis": [], "yAxis": [], "series": [],
     }  # fmt: skip
-    target = " − r" if any(curve.name == "x_r reference" for curve in drawn.run.curves) else ""
     for number, (panel, curves) in enumerate(panels.items()):
-        output = panel.removeprefix(_OUTPUT)
-        title = panel if output == panel else f"|{output}{target}|"
+        title = panel_title(panel, drawn.run.curves)
         top, is_last = number * (_HEAD + _PLOT + _GAP), number == len(panels) - 1
         unit = next((f" [{curve.unit}]" for curve in curves if curve.unit), "")
         scale = " (logarithmic)" if curves[0].is_logarithmic else ""

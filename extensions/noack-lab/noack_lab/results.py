@@ -3,6 +3,7 @@
 All of it can be computed in another process: arguments and results are plain data.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +24,8 @@ _POINTS = 121
 _GREEN, _DASHED = (51, 162, 78), (6.0, 2.5)
 _MARGIN_ACCURACY = 1e-3
 _CONTINUOUS = "in continuous time: "
+_OUTPUT = "output "
+"""What the name of the panel of an output's distance begins with."""
 
 
 class VerdictText(NamedTuple):
@@ -89,6 +92,13 @@ class ShownRun:
                 Fact(f"{norm_name} at the end", _number(norm[-1])),
             ]
         return [*facts, *([Fact("largest ‖e_c‖", _number(e_c.max()))] if len(e_c) else [])]
+
+
+def panel_title(panel: str, curves: Sequence[noack.Curve]) -> str:
+    """Return the title of a panel of a run with these curves: an output's is |y|, or |y − r|."""
+    output = panel.removeprefix(_OUTPUT)
+    target = " − r" if any(curve.name == "x_r reference" for curve in curves) else ""
+    return panel if output == panel else f"|{output}{target}|"
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ def test_a_loop_that_is_unstable_says_why_and_is_drawn() -> None:
     assert "a mode of the loop grows" in repr(explorer)
     norm = explorer.run.values("‖x‖ plant")
     assert norm[-1] > norm[0]
-    assert len(explorer.figure("V").axes) == 4
+    assert len(explorer.figure("V").axes) == 6
 
 
 def test_a_plant_that_is_not_linear_is_simulated_in_virtual_time_with_the_reason() -> None:
