@@ -98,8 +98,11 @@ def state_curves(
     x_c: Matrix,
     x_hat: Matrix | None = None,
     x_r: Matrix | None = None,
+    units: Sequence[str] | None = None,
 ) -> list[Curve]:
     """Return the curves of n states, (k, n): plant, both models, the sensor's estimate, the reference.
+
+    ``units`` are those of the states, if they are known.
 
     The widths differ, so that equal curves stay visible one inside the other.
     """
@@ -111,7 +114,7 @@ def state_curves(
         ("x_r reference", x_r, CurveStyle(THRESHOLD, 1.2, (4, 2))),
     ]
     return [
-        Curve(panel, name, "", t_s, states[:, i], style)
+        Curve(panel, name, units[i] if units else "", t_s, states[:, i], style)
         for i, panel in enumerate(names)
         for name, states, style in sources
         if states is not None

@@ -237,7 +237,8 @@ def draw_states(
         for curve in curves:  # those in front are thinner, so that equal curves stay visible
             style: dict[str, str] = {"label": ""} if i else {}
             draw_curve(axes, curve, zorder=2.5 - 0.1 * curve.style.width, **style)
-        axes.set_ylabel(label_text(name))
+        unit = f" [{label_text(curves[0].unit)}]" if curves[0].unit else ""
+        axes.set_ylabel(f"{label_text(name)}{unit}")
         set_times(axes, t_s, labelled=i + wide >= count)
         panels.append(axes)
     panels[0].set_title(heading + (f" ({count} of {n} states)" if count < n else ""))
@@ -314,7 +315,9 @@ def _states_of(record: RunRecord, samples: _Thinned) -> list[Curve]:
     x, x_hat = (run.x, None) if true_x is None else (true_x, run.x)
     reference = reference_in_run(record)
     x_r = None if reference is None else reference.states(run.t_ns)
-    return state_curves(record.loop.state_names, _seconds(run.t_ns), x, run.x_s, run.x_c, x_hat, x_r)
+    units = record.scenario.model.state_units
+    names, t_s = record.loop.state_names, _seconds(run.t_ns)
+    return state_curves(names, t_s, x, run.x_s, run.x_c, x_hat, x_r, units)
 
 
 def _errors_of(run: AlignedRun) -> list[Curve]:

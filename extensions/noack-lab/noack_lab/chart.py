@@ -53,6 +53,7 @@ def chart_options(drawn: Drawn) -> Json:
         "toolbox": {
             "right": 8,
             "top": 0,
+            "padding": 0,
             "itemSize": 13,
             "feature": {"dataZoom": {"yAxisIndex": "none"}, "saveAsImage": {}},
         },

@@ -94,7 +94,7 @@ def test_the_chart_has_a_panel_for_each_quantity_and_is_json() -> None:
     options = chart_options(Drawn(run, "psi", explorer.certificate.curves, before))
     titles = [title["text"].split(" (")[0] for title in options["title"]]
     assert titles == [
-        "psi", "|lateral offset| [m]", "|heading| [rad]", "error norms", "norm of the state",
+        "psi [rad]", "|lateral offset| [m]", "|heading| [rad]", "error norms", "norm of the state",
         "inter-event time [s]",
     ]  # fmt: skip
     assert json.loads(json.dumps(options, allow_nan=False))["xAxis"][0]["max"] == 4.0
