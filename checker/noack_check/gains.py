@@ -45,8 +45,8 @@ integrals are over times that do not overlap. So what p exceeds |p̂| by before 
 t_a sup |C e^{Hs} q| times this. Neither times between events nor numbers of updates on their way are assumed.
 With a periodic rule t − t_r ≤ Mh + d: v is followed from t_r, and nothing is counted as lost.
 
-*The input* is K e^{−Hs} x_c of an age s ≤ a: p = K e^{−Hs} e_c − ∫₀ˢ K e^{−Hτ} H x dτ. With a ball C around
-K e^{−Hs} for all ages, |p_j| ≤ |C_j e_c| + a |C_j H x|.
+*The input* is K e^{−Hs} x_c of an age s ≤ a: p = K e^{−Hs} e_c − sKHx + ∫₀ˢ (s − τ) K e^{−Hτ} H² x dτ.
+With a ball C around K e^{−Hs} for all ages, |p_j| ≤ |C_j e_c| + a |K_j H x| + a²/2 |C_j H² x|.
 
 *The state.* |Cx| ≤ sup |C e^{(A+BK)s} x(0)| + Σ_q ∫ |C e^{(A+BK)s} q| ds · |q̂|. By what p exceeds |p̂|
 before the first input, it adds at most t_a sup |C e^{(A+BK)s} q| times this: there p = −Kx, of which
@@ -269,7 +269,8 @@ class UnitGains:
         outputs |= {f"Kx {j}": rows_of(loop.gain, [j]) for j in range(m)}
         outputs |= {f"Ex {i}": rows_of(mismatch, [i]) for i in self._mismatched}
         if times.age > 0:
-            outputs |= {f"aged {j}": rows_of(aged, [j]) * H for j in range(m)}
+            outputs |= {f"aged {j}": rows_of(K, [j]) * H for j in range(m)}
+            outputs |= {f"bent {j}": rows_of(aged, [j]) * H * H for j in range(m)}
         columns = [source.column for source in self._sources] + [loop.start] * unit.has_start
         found = responses(self._closed + unit.rate * one, witness.plant, list(outputs.values()), columns)
         self._states = dict(zip(outputs, found, strict=True))
@@ -387,7 +388,9 @@ class UnitGains:
         """
         loop, one = self.loop, arb(1)
         for j in range(loop.B.ncols()):
-            aged = [(arb(loop.times.age), self.state(f"aged {j}"))] if loop.times.age > 0 else []
+            age, aged = arb(loop.times.age), list[tuple[arb, Form]]()
+            if loop.times.age > 0:
+                aged = [(age, self.state(f"aged {j}")), (age**2 / 2, self.state(f"bent {j}"))]
             yield f"p {j}", _sum((one, self.error(f"p {j}")), *aged)
             before = self._before[j]
             pairs = list(zip(before, self._sources, strict=False))
