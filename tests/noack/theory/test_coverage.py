@@ -106,7 +106,12 @@ def test_a_plant_that_is_not_linear_has_no_certificate_with_a_load() -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        ("description='another text'", "model.state_names=['p', 'v']", "speed=2.0", "start_within_s=9.0"),
+        (
+            "description='another text'",
+            "model.state_names=['position','v']",
+            "speed=2.0",
+            "start_within_s=9.0",
+        ),
         ("plant.disturbances.0.hz=9.0", "plant.disturbances.0.phase_rad=1.0"),
         ("network.limit=50", "network.encrypted=true", "controller.timeout_input=safe"),
         ("realtime.enabled=false", "clocks={largest_error_us=50.0}", "ports.sensor=4000"),
