@@ -19,6 +19,12 @@ event needs zᵀQz > θ². So a silent test leaves c = ‖Y(e_s − n + J(x + n)
 bound is convex in f₁ from 0 to 1. So c ≤ c₁f₁ + c₂f₂ if it is so at both ends: c₂ ≥ √(θ₂² + s₂²) and
 c₁ + c₂ ≥ √(max(θ₁, θ₂)² + (s₁ + s₂)²). In a single unit c ≤ √(θ² + s²).
 
+*Other rules* are followed as if they were one of these. If events are at most some time apart, as with a
+deadline, the rule may be taken for a periodic one of this period. A rule that needs ∫ ‖W(e_s − n)‖ dt > a
+may be taken for ‖W(e_s − n)‖ > a/T, for any T, with T for h: in the last T there was an event, or a time at
+which ‖W(e_s − n)‖ ≤ a/T, and no event after it. If tests are h' to h apart, the trapezoids of k of them give
+a/(kh') for a/T, and (k + 1)h for h.
+
 *After a test* e_s = Y⁻¹y − J(x + n) + n with ‖y‖ ≤ c, or e_s = n if it was an event. So |C e^{Hs} e_s| is
 at most the sum b(s) of the bounds of these three parts. The next test is at most h later. With a dwell time
 h is the time from an event on in which none is tested. For a periodic rule, which compares nothing, it is
@@ -35,15 +41,16 @@ M − 1. Go back from σ to the test before it, and from each lost event to the 
 
 with g and g' the suprema of b(s) up to h + d, and for ever, and k that of ‖C e^{Hs} W⁻¹‖ for ever. The sums
 are over the columns q of B, D, and of the identity for ω and Ex, with the suprema |q̂| of p, d, ω and Ex. The
-integrals are over times that do not overlap, so p before the first input adds at most t_a sup |C e^{Hs} q|
-|q̂|. Neither times between events nor numbers of updates on their way are assumed. With a periodic rule
-t − t_r ≤ Mh + d: v is followed from t_r, and nothing is counted as lost.
+integrals are over times that do not overlap. So what p exceeds |p̂| by before the first input adds at most
+t_a sup |C e^{Hs} q| times this. Neither times between events nor numbers of updates on their way are assumed.
+With a periodic rule t − t_r ≤ Mh + d: v is followed from t_r, and nothing is counted as lost.
 
-*The input* is K e^{−Hs} x_c of an age s ≤ a: p = K e^{−Hs} e_c − ∫₀ˢ K e^{−Hτ} H x dτ. With a ball C around
-K e^{−Hs} for all ages, |p_j| ≤ |C_j e_c| + a |C_j H x|.
+*The input* is K e^{−Hs} x_c of an age s ≤ a: p = K e^{−Hs} e_c − sKHx + ∫₀ˢ (s − τ) K e^{−Hτ} H² x dτ.
+With a ball C around K e^{−Hs} for all ages, |p_j| ≤ |C_j e_c| + a |K_j H x| + a²/2 |C_j H² x|.
 
-*The state.* |Cx| ≤ sup |C e^{(A+BK)s} x(0)| + Σ_q ∫ |C e^{(A+BK)s} q| ds · |q̂|. What acts up to t_a only
-adds at most t_a sup |C e^{(A+BK)s} q| |q̂|: p = −Kx, of which x = e^{At} x(0) + … gives a bound.
+*The state.* |Cx| ≤ sup |C e^{(A+BK)s} x(0)| + Σ_q ∫ |C e^{(A+BK)s} q| ds · |q̂|. By what p exceeds |p̂|
+before the first input, it adds at most t_a sup |C e^{(A+BK)s} q| times this: there p = −Kx, of which
+x = e^{At} x(0) + … gives a bound.
 
 *Conclusion.* For each signal these are inequalities v_i(t) ≤ (T v)(t) + g_i(t) with a positive linear T of
 the past, which maps y₁f₁ + y₂f₂ to at most F₁y₁ f₁ + F₂y₂ f₂. The solution has y > Fy + g in both units, and
@@ -58,12 +65,12 @@ they do not: see :mod:`.proof`.
 from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from flint import arb, arb_mat
+from flint import arb, arb_mat, fmpq
 
 from noack_check.balls import beside, columns_of, identity, is_positive, is_zero, rows_of, square, upto, zeros
 from noack_check.check import RejectedError
-from noack_check.document import read_matrix, read_number, read_rows, read_table
-from noack_check.loop import Loop
+from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
+from noack_check.loop import Loop, Rule
 from noack_check.model import thresholds
 from noack_check.noise import noise_of
 from noack_check.responses import Decay, Response, norm_of, responses, responses_until, upper
@@ -72,6 +79,8 @@ Form = Mapping[str, arb]
 """Σ coefficient · signal, by the signals' names; "1" is the constant 1."""
 _ROOM = 1e-9
 """By so much, relatively, y exceeds the solution of y = Fy + g."""
+_MOST_TESTS = 1_000_000
+"""Over which an integral is averaged."""
 _CHORDS, _BETTER = 8, 0.999
 """Chords of √(θ² + s²) that are tried, while they are less steep by this factor."""
 
@@ -109,7 +118,7 @@ class Source(NamedTuple):
     column: arb_mat
     of_state: Form
     of_error: Form
-    early: Form  # in both, up to the first input
+    early: Form  # in both, beside these, up to the first input
     is_outside: bool = False  # acts before the first input, too, beside p
 
 
@@ -177,6 +186,35 @@ def _comparison(loop: Loop, table: Mapping[str, object]) -> Comparison | None:
     return found
 
 
+def _followed(loop: Loop, table: Mapping[str, object]) -> Loop:
+    """Return the loop with the rule for which that of a loop is taken, as a document's table says."""
+    n, rule, times = loop.n, loop.rule, loop.times
+    if table.get("by_time", False):
+        if not times.longest > 0:
+            raise RejectedError("gains: by_time: the rule has no largest time between events")
+        none = zeros(0, 2 * n)
+        least = max(times.least_apart, min(times.longest, fmpq(1, 10**9)))
+        return loop._replace(
+            rule=Rule(none, none, arb(0), arb(0), arb(0)),
+            times=times._replace(
+                least_period=min(least, times.longest), period=times.longest, dwell=fmpq(0), longest=fmpq(0)
+            ),
+        )
+    if not rule.integrates:
+        return loop
+    if times.sampling > 0:
+        tests = read_count(table, "tests", _MOST_TESTS)
+        least, window = tests * times.least_sampling, (tests + 1) * times.sampling
+    else:
+        least = window = read_number(table, "window_s").fmpq()
+    if not least > 0:
+        raise RejectedError("gains: tests or window_s: not above 0")
+    return loop._replace(
+        rule=rule._replace(floor=rule.floor / arb(least), integrates=False),
+        times=times._replace(sampling=window, least_sampling=fmpq(0)),
+    )
+
+
 class UnitGains:
     """The inequalities in one unit, and their solution.
 
@@ -231,7 +269,8 @@ class UnitGains:
         outputs |= {f"Kx {j}": rows_of(loop.gain, [j]) for j in range(m)}
         outputs |= {f"Ex {i}": rows_of(mismatch, [i]) for i in self._mismatched}
         if times.age > 0:
-            outputs |= {f"aged {j}": rows_of(aged, [j]) * H for j in range(m)}
+            outputs |= {f"aged {j}": rows_of(K, [j]) * H for j in range(m)}
+            outputs |= {f"bent {j}": rows_of(aged, [j]) * H * H for j in range(m)}
         columns = [source.column for source in self._sources] + [loop.start] * unit.has_start
         found = responses(self._closed + unit.rate * one, witness.plant, list(outputs.values()), columns)
         self._states = dict(zip(outputs, found, strict=True))
@@ -268,7 +307,7 @@ class UnitGains:
         n, B = loop.n, loop.B * self._inputs
         for j in range(B.ncols()):
             amplitude = {f"p {j}": one}
-            yield Source(columns_of(B, [j]), amplitude, amplitude, {f"p before {j}": one})
+            yield Source(columns_of(B, [j]), amplitude, amplitude, {f"p more {j}": one})
         for i in self._boxed:
             amplitude = {f"box {i}": one}
             yield Source(columns_of(identity(n), [i]), amplitude, amplitude, {}, is_outside=True)
@@ -352,7 +391,9 @@ class UnitGains:
         """
         loop, one = self.loop, arb(1)
         for j in range(loop.B.ncols()):
-            aged = [(arb(loop.times.age), self.state(f"aged {j}"))] if loop.times.age > 0 else []
+            age, aged = arb(loop.times.age), list[tuple[arb, Form]]()
+            if loop.times.age > 0:
+                aged = [(age, self.state(f"aged {j}")), (age**2 / 2, self.state(f"bent {j}"))]
             yield f"p {j}", _sum((one, self.error(f"p {j}")), *aged)
             before = self._before[j]
             pairs = list(zip(before, self._sources, strict=False))
@@ -360,6 +401,8 @@ class UnitGains:
             terms = [(total, form) for total, source in outside for form in (source.of_error, source.early)]
             terms += [(before[-1].most, {"1": one})] if self.unit.has_start else []
             yield f"p before {j}", _sum(*terms)
+            yield f"p more {j}", {}
+            yield f"p more {j}", {f"p before {j}": one, f"p {j}": -one}
         for i in self._boxed:
             terms = [(loop.half_A[i, j], self.state(f"x[{j}]")) for j in range(loop.n)]
             terms += [(loop.half_B[i, j], self.input(j)) for j in range(loop.B.ncols())]
@@ -418,7 +461,7 @@ def _sum(*terms: tuple[arb, Form]) -> Form:
 
 def value(form: Form, sups: Mapping[str, arb]) -> arb:
     """Return the value of a form, rounded up."""
-    return upper(sum((size * sups[name] for name, size in form.items()), arb(0)))
+    return upper(sum((size * sups[name] for name, size in form.items()), arb(0)).max(arb(0)))
 
 
 def _solved(rows: Mapping[str, Form]) -> dict[str, arb]:
@@ -457,6 +500,7 @@ class Gains:
     """
 
     def __init__(self, loop: Loop, rate: arb, table: Mapping[str, object]) -> None:
+        loop = _followed(loop, table)
         require_covered(loop)
         self.loop, self.rate, witness = loop, rate, read_witness(loop, table)
         witness.plant.require(loop.A + loop.B * loop.gain + rate * identity(loop.n), "gains: plant")

@@ -42,6 +42,8 @@ class Rule(NamedTuple):
     If it is ``of_input``, z is (x, K e_s), also for Ψ, with n + m entries.
 
     ``always`` says that events may also come without the comparison, as after a deadline.
+
+    If it ``integrates``, an event needs ∫ ‖P z‖ dt > f since the last one, by trapezoids between tests.
     """
 
     positive: arb_mat  # P, (p, 2n)
@@ -52,6 +54,7 @@ class Rule(NamedTuple):
     always: bool = False
     memory: Memory | None = None  # of η; None: η = 0
     of_input: bool = False
+    integrates: bool = False
 
 
 class Times(NamedTuple):
@@ -73,6 +76,8 @@ class Times(NamedTuple):
     """They are at most this far apart; 0 for other rules."""
     dwell: fmpq = fmpq(0)
     """If it is not 0, the first test that counts after an event comes exactly this time after it."""
+    longest: fmpq = fmpq(0)
+    """Two events of a rule that compares are at most this far apart, as with a deadline; 0: not known."""
 
     @property
     def least_apart(self) -> fmpq:
@@ -290,8 +295,12 @@ class Loop(NamedTuple):
             return "times: events between tests"
         if rule.of_input and not self.needs_tests_apart:
             return "rule: of the input, and tested at any times"
-        if self.needs_tests_apart and not times.sampling == times.least_sampling > 0:
+        if rule.memory is not None and not times.sampling == times.least_sampling > 0:
             return "rule: needs tests at times that are a known time apart"
+        if times.longest > 0 and not rule.always:
+            return "times: events are due, and the rule needs its comparison"
+        if rule.integrates and (rule.level != 0 or rule.negative.nrows() or times.dwell > 0 or rule.always):
+            return "rule: integrates, and has more than a floor"
         if times.dwell > 0 and (times.dwell < times.sampling or times.period > 0):
             return "times: a dwell time that ends before the next test, or of a periodic rule"
         if rule.memory is not None and not rule.memory.starts_positive(n):

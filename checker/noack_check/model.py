@@ -225,6 +225,10 @@ class Model:
         self.is_periodic = loop.times.period > 0
         self._pieces, self.memory = pieces, loop.rule.memory
         self._places = None
+        if loop.rule.integrates:
+            raise ValueError("a rule that integrates has no forms")
+        if loop.needs_tests_apart and not loop.times.sampling == loop.times.least_sampling > 0:
+            raise ValueError("forms for a dwell time need tests that are a known time apart")
         if by_tests or loop.needs_tests_apart:
             self._places = Places(loop.losses, loop.times, later, later_at_start)
         self._clock = self._clock_nodes(pieces) if self.is_periodic else []

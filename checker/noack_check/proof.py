@@ -472,7 +472,7 @@ def compares_error(loop: Loop) -> bool:
 def _exceeds_by_error(loop: Loop) -> bool:
     """Return whether the rule compares ‖W e_s‖ with at least its threshold."""
     n, positive = loop.n, loop.rule.positive
-    if positive.nrows() != n or loop.rule.of_input:
+    if positive.nrows() != n or loop.rule.of_input or loop.rule.integrates:
         return False
     entries = (
         (positive[i, j], loop.weight[i, j - n] if j >= n else 0) for i in range(n) for j in range(2 * n)

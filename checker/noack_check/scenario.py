@@ -400,14 +400,24 @@ def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
         has_deadline = any(rule.get("policy") == "deadline" for rule in outer)
         least = times.least_sampling if has_deadline else grid
         times = times._replace(sampling=grid, least_sampling=least)
-    dwell_ns = _intervals(trigger).dwell
-    has_memory = inner.get("policy") == "dynamic"
-    if (dwell_ns or has_memory) and not times.sampling == times.least_sampling > 0:
-        name = "trigger.interval_s" if dwell_ns else f'trigger.policy = "{inner.get("policy")}"'
-        raise RefusedError(f"{name}: not covered without tests that are an exact time apart")
-    if dwell_ns:
-        tests = int((fmpq(dwell_ns, NS_PER_S) / times.sampling).ceil())
-        times = times._replace(dwell=tests * times.sampling)
+    intervals, sampling = _intervals(trigger), times.sampling
+    is_exact = sampling == times.least_sampling
+    if inner.get("policy") == "dynamic" and not (is_exact and sampling > 0):
+        raise RefusedError(
+            'trigger.policy = "dynamic": not covered without tests that are an exact time apart'
+        )
+    if intervals.dwell:
+        if not is_exact:
+            raise RefusedError("trigger.interval_s: not covered with tests that are not an exact time apart")
+        dwell = fmpq(intervals.dwell, NS_PER_S)
+        times = times._replace(dwell=(dwell / sampling).ceil() * sampling if sampling > 0 else dwell)
+    if intervals.longest and not (outer and inner.get("heartbeat")):
+        longest = fmpq(intervals.longest, NS_PER_S)
+        if not ideal:
+            longest = read_schedule(resolved).between_events(intervals.longest)[1]
+        elif outer:
+            longest += sampling
+        times = times._replace(longest=longest)
     return times
 
 
@@ -644,7 +654,9 @@ def _rule(trigger: Table, weight: arb_mat, model: Table) -> Rule:
     if _due_ns(trigger)[1]:
         nothing = zeros(0, 2 * weight.nrows())
         return Rule(nothing, nothing, arb(0), arb(0), arb(0))
-    rule = _compared(_combined(trigger)[-1], weight, model)
+    outer, rule = _combined(trigger)[:-1], _compared(_combined(trigger)[-1], weight, model)
+    if rule.integrates and outer:
+        raise RefusedError('trigger.policy = "send_on_area": not covered with a dwell time')
     return rule._replace(always=_intervals(trigger).longest > 0)
 
 
@@ -672,7 +684,9 @@ def _compared(trigger: Table, weight: arb_mat, model: Table) -> Rule:
         return rule._replace(positive=positive, negative=negative, floor=floor)
     if policy == "dynamic":
         return _dynamic(trigger, n, model)
-    end = ": not covered without a deadline" if policy in ("lyapunov", "send_on_area") else ": not covered"
+    if policy == "send_on_area":
+        return rule._replace(floor=number(_real(trigger, "trigger.delta_s")), integrates=True)
+    end = ": not covered without a deadline" if policy == "lyapunov" else ": not covered"
     raise RefusedError(f"trigger.policy = {policy!r}{end}")
 
 

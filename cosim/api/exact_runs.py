@@ -76,8 +76,12 @@ class ExactRun:
         unknown = ~self._has_controller_state(t_s)
         e_c_norm = run.system.norms(e_c)
         e_c[unknown], e_c_norm[unknown] = np.nan, np.nan
+        names, units = run.system.loop.state_names, scenario.named_model.state_units
+        stated = scenario.loop_outputs() if scenario.outputs else ()
+        distances = [(output, np.abs(x @ np.array(output.row))) for output in stated]  # x_r is 0
         return [
-            *curves.state_curves(run.system.loop.state_names, t_s, x, x + e_s, x + e_c),
+            *curves.state_curves(names, t_s, x, x + e_s, x + e_c, units=units),
+            *(curve for output, y in distances for curve in curves.output_curves(output, t_s, y)),
             *curves.error_curves(t_s, run.system.norms(e_s), e_c_norm, _threshold(scenario, t_s)),
             curves.norm_curve(t_s, np.linalg.norm(x, axis=1)),
             *curves.transmission_curves(run.event_s, run.delivered),

@@ -98,8 +98,11 @@ def state_curves(
     x_c: Matrix,
     x_hat: Matrix | None = None,
     x_r: Matrix | None = None,
+    units: Sequence[str] | None = None,
 ) -> list[Curve]:
     """Return the curves of n states, (k, n): plant, both models, the sensor's estimate, the reference.
+
+    ``units`` are those of the states, if they are known.
 
     The widths differ, so that equal curves stay visible one inside the other.
     """
@@ -111,7 +114,7 @@ def state_curves(
         ("x_r reference", x_r, CurveStyle(THRESHOLD, 1.2, (4, 2))),
     ]
     return [
-        Curve(panel, name, "", t_s, states[:, i], style)
+        Curve(panel, name, units[i] if units else "", t_s, states[:, i], style)
         for i, panel in enumerate(names)
         for name, states, style in sources
         if states is not None
@@ -139,9 +142,9 @@ def error_curves(t_s: Vector, e_s: Vector, e_c: Vector, threshold: Vector | None
     return curves
 
 
-def norm_curve(t_s: Vector, norm: Vector) -> Curve:
-    """Return ‖x‖, (k,)."""
-    return Curve(STATE_NORM, "‖x‖ plant", "", t_s, norm, CurveStyle(PLANT, 2.4))
+def norm_curve(t_s: Vector, norm: Vector, name: str = "‖x‖") -> Curve:
+    """Return ‖x‖, or the norm of that name, (k,)."""
+    return Curve(STATE_NORM, f"{name} plant", "", t_s, norm, CurveStyle(PLANT, 2.4))
 
 
 def input_curves(names: Sequence[str], t_s: Vector, u: Matrix) -> list[Curve]:

@@ -93,7 +93,7 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
     claims = [claim for claim in loop.claims if claim.until_s is None]  # they hold to the end of the run
     held = [claim for claim in claims if claim.output and claim.verdict == "held"]
     guaranteed = {claim.output: claim.what for claim in held if " stays within " in claim.what}
-    texts, is_good = [], not _grew(loop)
+    texts, is_good, is_late = [], not _grew(loop), loop.certified_for is not None
     for output in loop.outputs:
         if output.allowed is None:
             continue
@@ -105,15 +105,22 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
             texts.append(f"{output.name} was within {allowed} of its {output.target} {since}")
         what = guaranteed.get(output.name, "")
         promised = what.rpartition(" from ")[2] if f" of its {output.target} " in what else ""
-        texts[-1] += f" (guaranteed from {promised})" if promised else " (not guaranteed)"
+        lacking = "not guaranteed for delays as in this run" if is_late else "not guaranteed"
+        texts[-1] += f" (guaranteed from {promised})" if promised else f" ({lacking})"
         is_good = is_good and output.settled_s is not None
+    together = " and "
     if not texts:
-        texts = [f"{output.name} was at most {_with_unit(output.largest, output)}" for output in loop.outputs]
+        together = ", and "
+        texts = [
+            f"{output.name} was at most {_with_unit(output.largest, output)}, "
+            f"at the end {_with_unit(output.last, output)}"
+            for output in loop.outputs
+        ]
     packets = counted(loop.longest_loss_burst, "consecutive packet")
     losses = f", although up to {packets} {'was' if loop.longest_loss_burst == 1 else 'were'} lost"
     if not is_good:
         losses = f", with up to {packets} lost"
-    text = f"{' and '.join(texts)}{losses if loop.longest_loss_burst else ''}"
+    text = f"{together.join(texts)}{losses if loop.longest_loss_burst else ''}"
     return _line(text, Tone.GOOD if is_good else Tone.DOUBTFUL)
 
 

@@ -104,8 +104,8 @@ class PlantOutline(NamedTuple):
 
     n: int
     """Number of states."""
-    m: int
-    """Number of inputs."""
+    m: int | None
+    """Number of inputs; None: they do not say."""
     states: tuple[str, ...] | None = None
     """Names of the states, if they have any, perhaps with units: "angle, rad"."""
     inputs: tuple[str, ...] | None = None

@@ -59,9 +59,10 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
         """Return what the class says in ``states``, ``inputs``, ``allowed`` and ``initial_state``."""
         with user_code(self, _PLACE, CallerError):
             plant, _ = new_instance(self, _PLACE)
-            if not hasattr(plant, "states") or not hasattr(plant, "inputs"):
+            if not hasattr(plant, "states"):
                 return None
-            states, inputs = _texts("states", plant.states), _texts("inputs", plant.inputs)
+            states = _texts("states", plant.states)
+            inputs = _texts("inputs", plant.inputs) if hasattr(plant, "inputs") else None
             names = [name_and_unit(state)[0] for state in states]
             allowed = getattr(plant, "allowed", {})
             if not isinstance(allowed, Mapping):
@@ -74,7 +75,8 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
             start = getattr(plant, "initial_state", None)
             x0 = None if start is None else real_vector("initial_state", start, len(states))
         initial_state = None if x0 is None else tuple(x0.tolist())
-        return PlantOutline(len(states), len(inputs), states, inputs, None, dict(allowed), initial_state)
+        m = None if inputs is None else len(inputs)
+        return PlantOutline(len(states), m, states, inputs, None, dict(allowed), initial_state)
 
 
 def _texts(name: str, values: object) -> tuple[str, ...]:

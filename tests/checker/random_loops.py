@@ -102,3 +102,20 @@ def random_quadratic_loop(rng: np.random.Generator) -> Loop:
     rule = loop.rule._replace(positive=matrix(positive.tolist()), negative=matrix(negative.tolist()))
     noise = number(0.003) * identity(n) if rng.random() < 0.3 else loop.noise
     return loop._replace(rule=rule, noise=noise)
+
+
+def random_due_loop(rng: np.random.Generator) -> Loop:
+    """Return a loop with a deadline, of a threshold that alone would bound little."""
+    loop = random_loop(rng)
+    rule = loop.rule._replace(always=True, level=arb(0), floor=number(2.0))
+    longest = loop.times.sampling * int(rng.integers(2, 12))
+    return loop._replace(rule=rule, times=loop.times._replace(longest=longest))
+
+
+def random_area_loop(rng: np.random.Generator) -> Loop:
+    """Return a loop whose rule integrates the error, sometimes with noise."""
+    loop = random_loop(rng)
+    area = 0.05 * float(rng.integers(1, 10)) * float(loop.times.sampling.p) / float(loop.times.sampling.q)
+    rule = loop.rule._replace(integrates=True, level=arb(0), floor=number(round(area, 6)))
+    noise = number(0.003) * identity(loop.n) if rng.random() < 0.3 else loop.noise
+    return loop._replace(rule=rule, noise=noise)

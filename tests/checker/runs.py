@@ -69,7 +69,7 @@ def exceeded(
 ) -> list[Exceeded]:
     """Return where a random run exceeds what is proven; by forms this is a root of a sum of squares."""
     plant, times, rule = _Plant(loop, rng), [float(t.p) / float(t.q) for t in loop.times], loop.rule
-    sampling, least, delay, age, start, *periods, dwell = times
+    sampling, least, delay, age, start, *periods, dwell, longest = times
     next_event = rng.choice(periods) if periods[1] else np.inf  # of a periodic rule
     if periods[1] and loop.observer is None:
         least = sampling = periods[1] / _PARTS
@@ -99,6 +99,7 @@ def exceeded(
     style = rng.integers(3)
     ages = [0.0, age, age / 2]
     t, lost, events = 0.0, 0, [0.0]
+    area = last_size = last_test = 0.0  # of a rule that integrates
     arriving: list[tuple[float, float, Array]] = []
     """Of each update on its way: when it acts, when it was sent, and the prediction that starts with it."""
     next_test, found = sampling, list[Exceeded]()
@@ -136,7 +137,14 @@ def exceeded(
             threshold = np.hypot(max(level * np.exp(-rate * t), floor), np.linalg.norm(negative @ seen))
             threshold = np.hypot(threshold, np.sqrt(max(eta, 0.0)))
             fires = np.linalg.norm(positive @ seen) > threshold or (rule.always and rng.random() < 0.2)
+            if rule.integrates:
+                now = float(np.linalg.norm(positive @ seen))
+                area += (t - last_test) * (now + last_size) / 2
+                fires, last_size, last_test = area > floor, now, t
+                if fires:
+                    area = last_size = 0.0
             fires = fires and t - events[-1] > dwell - 1e-9
+            fires = fires or bool(longest and t + sampling - events[-1] > longest + 1e-9)
             if periods[1]:
                 fires = t >= next_event
             remembered.test(seen if not fires else np.concatenate([y, 0 * seen[n:]]))

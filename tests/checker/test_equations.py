@@ -213,6 +213,7 @@ def test_false_witnesses_of_a_region_are_rejected(
 @pytest.mark.parametrize("names", [["angle"], ["angle", "rate", "time"]])
 def test_each_state_has_a_name_or_none_has(witness: dict[str, Any], names: list[str]) -> None:
     changed = copy.deepcopy(witness)
+    del changed["scenario"]["outputs"]
     changed["scenario"]["model"]["state_names"] = names
     with pytest.raises(RefusedError, match="not 2 names"):
         list(check_file(changed, None))

@@ -10,7 +10,7 @@ import pytest
 from flint import arb, fmpq
 from scipy.linalg import expm
 
-from noack.theory.witnesses.documents import witness_by_gains
+from noack.theory.witnesses.documents import find_witness, witness_by_gains
 from noack.theory.witnesses.effort import NoWitnessError
 from noack.theory.witnesses.gains import _lyapunov
 from noack_check.balls import beside, identity, matrix, number, zeros
@@ -21,6 +21,8 @@ from noack_check.responses import Decay, responses, responses_until
 from noack_check.scenario import _squares
 from noack_check.sentences import smallest_bounds
 from tests.checker.random_loops import (
+    random_area_loop,
+    random_due_loop,
     random_loop,
     random_loop_with_long_delays,
     random_noisy_loop,
@@ -291,6 +293,78 @@ def test_a_threshold_and_a_share_of_x_do_not_add_up() -> None:
     assert found["e_s"] == pytest.approx(math.hypot(0.1, 0.1 * found["x"]), rel=1e-3)
 
 
+def test_a_bound_of_the_input_error_that_holds_at_all_times_counts_alone() -> None:
+    """If p = −Kx before the first input is below what p is at most later, this time changes nothing of x."""
+    loop = scalar(2, SCHEDULE, level=0.0, floor=1.0)._replace(start=number(0.01) * identity(1))
+    later, at_once = (sizes(by_gains(each)[1])["x"] for each in (changed(loop, start=fmpq(1, 5)), loop))
+    assert later == pytest.approx(at_once, rel=1e-2)
+
+
+# Rules that are taken for others.
+
+DISTURBED = scalar(0, SCHEDULE)._replace(pushes=identity(1), sizes=(number(0.1),))
+DUE = changed(
+    DISTURBED._replace(rule=scalar().rule._replace(level=arb(0), floor=number(10.0), always=True)),
+    longest=fmpq(1, 20),
+)
+AREA = DISTURBED._replace(rule=scalar().rule._replace(level=arb(0), floor=number(0.01), integrates=True))
+
+
+def test_a_deadline_bounds_what_a_threshold_does_not() -> None:
+    loose = by_gains(DUE._replace(rule=DUE.rule._replace(always=False), times=SCHEDULE))[1]
+    document, proof = by_gains(DUE)
+    assert document["gains"]["by_time"]
+    assert sizes(proof)["e_c"] < 0.05 * sizes(loose)["e_c"]
+    small = DUE._replace(rule=DUE.rule._replace(floor=number(1e-3)))
+    assert "by_time" not in by_gains(small)[0]["gains"]
+
+
+def test_a_rule_without_a_deadline_is_not_taken_for_a_periodic_one() -> None:
+    document = by_gains(DUE)[0]
+    loop = DUE._replace(rule=DUE.rule._replace(always=False), times=SCHEDULE)
+    with pytest.raises(RejectedError, match="by_time: the rule has no largest time"):
+        prove(loop, document)
+    with pytest.raises(RejectedError, match="events are due, and the rule needs its comparison"):
+        prove(DUE._replace(rule=loop.rule), document)
+
+
+@pytest.mark.parametrize("tests", [0, -1, 2.5, 10**9])
+def test_an_integral_is_averaged_over_some_tests(tests: float) -> None:
+    document = copy.deepcopy(by_gains(AREA)[0])
+    document["gains"]["tests"] = tests
+    with pytest.raises(RejectedError, match="tests"):
+        prove(AREA, document)
+
+
+@pytest.mark.parametrize("window_s", [0.0, -0.1])
+def test_an_integral_is_averaged_over_some_time(window_s: float) -> None:
+    loop = AREA._replace(times=IDEAL)
+    document = copy.deepcopy(by_gains(loop)[0])
+    document["gains"]["window_s"] = window_s
+    with pytest.raises(RejectedError, match="window_s"):
+        prove(loop, document)
+
+
+def test_a_rule_that_integrates_has_nothing_but_a_floor() -> None:
+    document = by_gains(AREA)[0]
+    share = AREA.rule._replace(negative=matrix([[1, 0]]))
+    for loop in (AREA._replace(rule=share), changed(AREA, dwell=fmpq(1, 10))):
+        with pytest.raises(RejectedError, match="integrates"):
+            prove(loop, document)
+
+
+def test_no_forms_are_those_of_a_rule_that_integrates() -> None:
+    loop = double_integrator(SCHEDULE)
+    document = find_witness(loop, ("x",)).document
+    with pytest.raises(RejectedError, match="integrates"):
+        prove(loop._replace(rule=loop.rule._replace(integrates=True, level=arb(0))), document)
+
+
+def test_a_dwell_time_has_bounds_with_tests_at_all_times() -> None:
+    loop = changed(scalar(0, floor=0.02), dwell=fmpq(1, 20))
+    assert sizes(by_gains(scalar(0, floor=0.02))[1])["e_s"] < sizes(by_gains(loop)[1])["e_s"] < 0.3
+
+
 LIES: dict[str, tuple[Loop, Callable[[Loop], Loop]]] = {
     "a loss": (scalar(times=SCHEDULE, floor=0.02), lambda loop: loop._replace(losses=0)),
     "noise": (
@@ -328,6 +402,10 @@ LIES: dict[str, tuple[Loop, Callable[[Loop], Loop]]] = {
         ),
         lambda loop: loop._replace(rule=loop.rule._replace(positive=matrix([[0, 1]]))),
     ),
+    "a late deadline": (
+        changed(DUE, longest=fmpq(1, 4)), lambda loop: changed(loop, longest=fmpq(1, 50)),
+    ),
+    "a large area": (AREA, lambda loop: loop._replace(rule=loop.rule._replace(floor=number(1e-4)))),
     "slow tests": (
         changed(scalar(0, SCHEDULE), sampling=fmpq(1, 5), least_sampling=fmpq(1, 5)),
         lambda loop: changed(loop, sampling=fmpq(1, 100), least_sampling=fmpq(1, 100)),
@@ -350,6 +428,8 @@ DRAWS = (
     random_noisy_loop,
     random_loop_with_long_delays,
     random_quadratic_loop,
+    random_due_loop,
+    random_area_loop,
 )
 
 

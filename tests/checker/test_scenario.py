@@ -374,8 +374,12 @@ def test_the_keys_that_the_table_calls_used_are_those_that_are_read() -> None:
     identity = "plant.measurement.C=[[1.0, 0.0], [0.0, 1.0]]"
     box = ("plant.uncertainty_A=[[0.1, 0.0], [0.0, 0.0]]", "plant.uncertainty_B=[[0.0], [0.25]]")
     forecast = "growth_per_s=1, mismatch_per_s=1, shortest_s=0.1, longest_s=0.5"
-    self_triggered = f'policy="self_triggered", beta=0.1, alpha_per_s=0.2, {forecast}'
-    for trigger in (*TRIGGERS, 'policy="decaying", beta=0.1, alpha_per_s=0.2', self_triggered):
+    others = (
+        f'policy="self_triggered", beta=0.1, alpha_per_s=0.2, {forecast}',
+        'policy="decaying", beta=0.1, alpha_per_s=0.2',
+        'policy="send_on_area", delta_s=0.1',
+    )
+    for trigger in (*TRIGGERS, *others):
         settings = (f"trigger={{{trigger}}}", constraint, identity, DISTURBANCES, *box)
         tables = resolved_tables("double_integrator", *settings, "plant.watchdog.policy=zero")
         read_loop(Recorded(tables, read), box=True, ideal=False)
@@ -410,7 +414,7 @@ def test_the_outputs_of_a_scenario_are_rows_with_names() -> None:
     np.testing.assert_array_equal(floats(loop.output_rows), [[0.5, 0.1], [0.0, 1.0]])
     assert output_names(tables) == ["tip", "rate"]
     states = resolved_tables("unstable_pendulum")
-    states.pop("outputs", None)
+    del states["outputs"]
     np.testing.assert_array_equal(floats(read_loop(states, box=False, ideal=False).output_rows), np.eye(2))
     assert output_names(states) == ["angle", "rate"]
     tables["outputs"][0]["row"] = [0.5]

@@ -409,13 +409,12 @@ def test_rules_whose_events_do_not_depend_on_a_comparison(name: str) -> None:
 @pytest.mark.parametrize(
     ("trigger", "ideal", "key"),
     [
-        (
-            {"policy": "dwell", "interval_s": 0.1, "rule": {"policy": "absolute", "delta": 0.1}},
-            True,
-            "trigger.interval_s",
-        ),
         (DYNAMIC, True, "trigger.policy"),
-        ({"policy": "send_on_area", "delta_s": 0.1}, False, "trigger.policy"),
+        (
+            {"policy": "dwell", "interval_s": 0.1, "rule": {"policy": "send_on_area", "delta_s": 0.1}},
+            False,
+            "trigger.policy",
+        ),
         ({"policy": "lyapunov", "rate_per_s": 0.3}, False, "trigger.policy"),
     ],
 )

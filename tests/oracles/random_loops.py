@@ -57,6 +57,7 @@ def random_loop(seed: int) -> RandomLoop:
     period_s = step_s * int(rng.integers(2, 21))
     delay_s = 0.0 if rng.random() < 0.7 else 0.4 * step_s
     content = load(find_scenario("double_integrator")).model_dump(mode="json", exclude_none=True)
+    del content["outputs"]
     content |= {
         "mode": mode,
         "model": {"A": A.tolist(), "B": B.tolist(), "gain": K.tolist()},

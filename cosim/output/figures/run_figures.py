@@ -55,7 +55,7 @@ from cosim.output.figures.timing_figures import (
 from cosim.record.align import AlignedRun, Reals, aligned_parts
 from cosim.record.decimation import decimate_all
 from cosim.record.run_events import packet_outcomes, reference_in_run
-from cosim.record.run_record import RunRecord
+from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.row_operations import row_norms
 from noack.guarantee.loss_guarantee import LossesInWindow
@@ -139,7 +139,7 @@ def run_curves(record: RunRecord) -> list[Curve]:
         *_states_of(record, samples),
         *(curve for output in _stated_outputs(record) for curve in _output_curves(record, output)),
         *_errors_of(samples.run),
-        norm_curve(*_decimated(record, PLANT_STEP, "x", row_norms)),
+        _norm_of(record),
         *input_curves(record.loop.input_names, *_decimated(record, CONTROLLER_STEP, "u")),
         *transmission_curves(_seconds(events["t_ns"]), delivered),
         *bound_curves(envelopes(record)),
@@ -187,12 +187,13 @@ def _from_first_update(run: AlignedRun, record: RunRecord) -> AlignedRun:
 
 @np.errstate(all="ignore")  # a run may diverge
 def _decimated(
-    record: RunRecord, table: str, column: str, curves: Callable[[Reals], Reals] = np.asarray
+    record: RunRecord, table: str, column: str, curves: Callable[[Rows], Reals] | None = None
 ) -> tuple[Reals, Reals]:
-    """Return times in s (k,) and curves of a vector column (k, …), reduced like the samples."""
-    t_s, values = [np.zeros(0)], [curves(np.zeros((0, *record.tables[table][column].shape)))]
+    """Return times in s (k,) and a vector column, or curves of it, (k, …), reduced like the samples."""
+    taken = (lambda rows: np.asarray(rows[column])) if curves is None else curves
+    t_s, values = [np.zeros(0)], [taken(np.zeros(0, record.tables[table]))]
     for rows in record.batches(table, ("t_ns", column)):
-        part_s, part = _seconds(rows["t_ns"]), curves(rows[column])
+        part_s, part = _seconds(rows["t_ns"]), taken(rows)
         keep = decimate_all(part_s, part.reshape(len(part), -1), record.slice_columns)
         t_s.append(part_s[keep])
         values.append(part[keep])
@@ -236,7 +237,8 @@ def draw_states(
         for curve in curves:  # those in front are thinner, so that equal curves stay visible
             style: dict[str, str] = {"label": ""} if i else {}
             draw_curve(axes, curve, zorder=2.5 - 0.1 * curve.style.width, **style)
-        axes.set_ylabel(label_text(name))
+        unit = f" [{label_text(curves[0].unit)}]" if curves[0].unit else ""
+        axes.set_ylabel(f"{label_text(name)}{unit}")
         set_times(axes, t_s, labelled=i + wide >= count)
         panels.append(axes)
     panels[0].set_title(heading + (f" ({count} of {n} states)" if count < n else ""))
@@ -313,7 +315,9 @@ def _states_of(record: RunRecord, samples: _Thinned) -> list[Curve]:
     x, x_hat = (run.x, None) if true_x is None else (true_x, run.x)
     reference = reference_in_run(record)
     x_r = None if reference is None else reference.states(run.t_ns)
-    return state_curves(record.loop.state_names, _seconds(run.t_ns), x, run.x_s, run.x_c, x_hat, x_r)
+    units = record.scenario.model.state_units
+    names, t_s = record.loop.state_names, _seconds(run.t_ns)
+    return state_curves(names, t_s, x, run.x_s, run.x_c, x_hat, x_r, units)
 
 
 def _errors_of(run: AlignedRun) -> list[Curve]:
@@ -424,14 +428,32 @@ def _errors(scenario: Scenario, run: AlignedRun, bounds: list[Curve]) -> PageFig
     )
 
 
+def _norm_of(record: RunRecord) -> Curve:
+    """Return ‖x‖ over the steps of the plant; with a reference or loads the distance that is bounded."""
+    reference, rest = reference_in_run(record), record.loop.rest
+
+    def distances(rows: Rows) -> Reals:
+        if reference is not None:
+            return row_norms(rows["x"] - reference.states(rows["t_ns"]))
+        return row_norms(rows["x"] - rest if rest.any() else rows["x"])
+
+    name = "‖x‖" if reference is None and not rest.any() else "‖x − x_r‖"
+    return norm_curve(*_decimated(record, PLANT_STEP, "x", distances), name)
+
+
 def _state_norm(record: RunRecord, bounds: list[Curve]) -> PageFigure:
-    t_s, norm = _decimated(record, PLANT_STEP, "x", row_norms)
-    ends = f", from {norm[0]:.3g} to {norm[-1]:.3g}" if len(norm) else ""
+    curve = _norm_of(record)
+    ends = f", from {curve.values[0]:.3g} to {curve.values[-1]:.3g}" if len(curve.t_s) else ""
+    name = "Norm of the plant's state"
+    if reference_in_run(record) is not None:
+        name += " from its reference"
+    elif record.loop.rest.any():
+        name += " from its rest under the load"
     return one_panel(
         "state-norm",
         2.1,
-        lambda axes: draw_norms(axes, "Norm of the state", [norm_curve(t_s, norm)], bounds),
-        caption="Norm of the plant's state." + _dashed(bounds),
+        lambda axes: draw_norms(axes, "Norm of the state", [curve], bounds),
+        caption=f"{name}." + _dashed(bounds),
         description=f"Norm of the state over time on a logarithmic axis{ends}.",
     )
 

@@ -190,7 +190,7 @@ def _styles(layout: LoopLayout) -> dict[str, Static]:
         ERROR: rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4]),
         ERROR_LOG10: rr.SeriesLines(names=errors, colors=colours, widths=widths),
         SIZE_LOG10: rr.SeriesLines(
-            names=["certified", "‖x‖ plant"],
+            names=["certified", "‖x‖ plant" if layout.reference is None else "‖x − x_r‖ plant"],
             colors=[CERTIFIED, PLANT],
             widths=[2.0, 2.5],
         ),

@@ -224,9 +224,9 @@ class LoopView:
         # On a linear scale, a certified bound would flatten everything else.
         self._send(bp.ERROR, t_ns, norms[:, :4])
         self._send(bp.ERROR_LOG10, t_ns, _log10(norms, aligned.threshold))
-        sizes = np.column_stack([x_bounds, np.linalg.norm(aligned.x, axis=1)])
-        self._send(bp.SIZE_LOG10, t_ns, _log10(sizes, aligned.threshold))
         deviations = aligned.x if reference is None else aligned.x - reference.states(t_ns)
+        sizes = np.column_stack([x_bounds, np.linalg.norm(deviations, axis=1)])
+        self._send(bp.SIZE_LOG10, t_ns, _log10(sizes, aligned.threshold))
         for i, output in enumerate(self._layout.outputs):
             bound = np.full(len(t_ns), np.nan) if y_bounds is None else y_bounds[:, i]
             allowed = np.full(len(t_ns), np.nan if output.allowed is None else output.allowed)

@@ -118,8 +118,11 @@ def plant_reference(
         if outline.rate_hz is not None:
             rates = {"rate_hz": float(f"{outline.rate_hz:.12g}")}
         names = _plain_names(outline.states), _plain_names(outline.inputs)
+        m = outline.m
+        if m is None:
+            _, m = _sizes_of_class(system, label, (outline.n, sizes[1]))
         return PlantReference(
-            label, settings, system, outline.n, outline.m, names, rates, outline.initial_state,
+            label, settings, system, outline.n, m, names, rates, outline.initial_state,
             _units(outline.states), {plain_name(name): value for name, value in outline.allowed.items()},
         )  # fmt: skip
     if isinstance(system, PythonPlantSettings):
@@ -230,7 +233,7 @@ def _units(states: tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def _sizes_of_class(
-    system: PythonPlantSettings, label: str, sizes: tuple[int | None, int | None]
+    system: PlantSettings, label: str, sizes: tuple[int | None, int | None]
 ) -> tuple[int, int]:
     """Return the smallest numbers of states and inputs that a user's class accepts."""
     ranges = [range(1, _LARGEST_TRIED_SIZE + 1) if size is None else (size,) for size in sizes]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import noack
-from noack_lab.results import ShownRun
+from noack_lab.results import NORM, ShownRun, panel_title
 
 Json = dict[str, Any]
 
@@ -53,12 +53,14 @@ def chart_options(drawn: Drawn) -> Json:
         "toolbox": {
             "right": 8,
             "top": 0,
+            "padding": 0,
             "itemSize": 13,
             "feature": {"dataZoom": {"yAxisIndex": "none"}, "saveAsImage": {}},
         },
         "title": [], "legend": [], "grid": [], "xAxis": [], "yAxis": [], "series": [],
     }  # fmt: skip
-    for number, (title, curves) in enumerate(panels.items()):
+    for number, (panel, curves) in enumerate(panels.items()):
+        title = panel_title(panel, drawn.run.curves)
         top, is_last = number * (_HEAD + _PLOT + _GAP), number == len(panels) - 1
         unit = next((f" [{curve.unit}]" for curve in curves if curve.unit), "")
         scale = " (logarithmic)" if curves[0].is_logarithmic else ""
@@ -107,7 +109,8 @@ def _panels(drawn: Drawn) -> dict[str, list[noack.Curve]]:
     panels: dict[str, list[noack.Curve]] = {}
     if drawn.reference is not None:
         for curve in drawn.reference.curves:
-            if curve.name in ("x plant", "‖e_c‖ controller", "‖x‖ plant"):
+            is_norm = curve.panel == NORM and curve.name.endswith(" plant")
+            if is_norm or curve.name in ("x plant", "‖e_c‖ controller"):
                 style = noack.CurveStyle(_GREY, 1.2, (4, 3))
                 faint = noack.Curve(curve.panel, REFERENCE, curve.unit, curve.t_s, curve.values, style)
                 panels.setdefault(curve.panel, []).append(faint)

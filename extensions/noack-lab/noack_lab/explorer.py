@@ -94,7 +94,7 @@ class Explorer:
         figure = Figure((_WIDTH_IN, _PANEL_IN * len(panels)), layout="constrained")
         axes: Any = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
         for ax, panel in zip(axes, panels, strict=True):
-            _draw(ax, [curve for curve in curves if curve.panel == panel])
+            _draw(ax, results.panel_title(panel, curves), [curve for curve in curves if curve.panel == panel])
         axes[-1].set_xlabel("time t [s]")
         return figure
 
@@ -109,7 +109,7 @@ class Explorer:
         return "\n".join([self.scenario.name, *lines, results.kept_line(self.run, self.certificate).text])
 
 
-def _draw(ax: "Axes", curves: list[noack.Curve]) -> None:
+def _draw(ax: "Axes", title: str, curves: list[noack.Curve]) -> None:
     """Draw the curves of a panel."""
     for curve in curves:
         style = curve.style
@@ -127,7 +127,7 @@ def _draw(ax: "Axes", curves: list[noack.Curve]) -> None:
             drawstyle="steps-post" if style.is_held else "default",
         )
     unit = f" [{curves[0].unit}]" if curves[0].unit else ""
-    ax.set_title(f"{curves[0].panel}{unit}", loc="left", fontsize="medium")
+    ax.set_title(f"{title}{unit}", loc="left", fontsize="medium")
     if curves[0].is_logarithmic:
         ax.set_yscale("log")
     ax.legend(loc="upper right", fontsize="small")

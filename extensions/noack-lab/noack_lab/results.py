@@ -3,6 +3,7 @@
 All of it can be computed in another process: arguments and results are plain data.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +23,9 @@ _POINTS = 121
 """Times at which certified bounds are drawn."""
 _GREEN, _DASHED = (51, 162, 78), (6.0, 2.5)
 _MARGIN_ACCURACY = 1e-3
+_CONTINUOUS = "in continuous time: "
+_OUTPUT = "output "
+"""What the name of the panel of an output's distance begins with."""
 
 
 class VerdictText(NamedTuple):
@@ -71,7 +75,9 @@ class ShownRun:
     @property
     def facts(self) -> list[Fact]:
         """The key numbers."""
-        arrived, norm, e_c = self.transmissions, self.values("‖x‖ plant"), self.values("‖e_c‖ controller")
+        arrived, e_c = self.transmissions, self.values("‖e_c‖ controller")
+        name = next((curve.name for curve in self.curves if curve.panel == NORM), "")
+        norm, norm_name = self.values(name), name.removesuffix(" plant")
         lost = int(np.sum(~arrived))
         share = f" ({100 * lost / len(arrived):.0f} %)" if len(arrived) else ""
         bursts = np.diff(np.flatnonzero(np.concatenate([[True], arrived, [True]]))) - 1
@@ -81,8 +87,18 @@ class ShownRun:
             Fact("longest loss burst", str(int(bursts.max(initial=0)))),
         ]
         if len(norm):
-            facts += [Fact("‖x‖ at the start", _number(norm[0])), Fact("‖x‖ at the end", _number(norm[-1]))]
+            facts += [
+                Fact(f"{norm_name} at the start", _number(norm[0])),
+                Fact(f"{norm_name} at the end", _number(norm[-1])),
+            ]
         return [*facts, *([Fact("largest ‖e_c‖", _number(e_c.max()))] if len(e_c) else [])]
+
+
+def panel_title(panel: str, curves: Sequence[noack.Curve]) -> str:
+    """Return the title of a panel of a run with these curves: an output's is |y|, or |y − r|."""
+    output = panel.removeprefix(_OUTPUT)
+    target = " − r" if any(curve.name == "x_r reference" for curve in curves) else ""
+    return panel if output == panel else f"|{output}{target}|"
 
 
 @dataclass(frozen=True)
@@ -106,7 +122,7 @@ def run_of(scenario: noack.Scenario) -> ShownRun:
     except noack.NoackError as error:
         if scenario.loops:
             raise CallerError("a scenario of several loops: run it live") from None
-        note = str(error)
+        note = f"in virtual time; an exact run is not possible: {str(error).removeprefix(_CONTINUOUS)}"
     run = noack.simulate(scenario)
     curves = [curve for curve in run.curves() if curve.style.colour != _GREEN]  # bounds come later
     return ShownRun(SIMULATED, curves, _lines(run), note)
@@ -136,7 +152,10 @@ def guarantee_of(scenario: noack.Scenario) -> Guarantee:
     style = noack.CurveStyle(_GREEN, 1.6, _DASHED)
     with np.errstate(all="ignore"):
         bounds = [(ERRORS, certificate.controller_error(t_s)), (NORM, certificate.state(t_s))]
+        of_outputs = certificates.output_bounds(certificate) if scenario.outputs else []
+        bounds += [(of_each.output.distance, of_each.certificate.state(t_s)) for of_each in of_outputs]
     facts = [
+        *(Fact(each.output.name, each.statement.removeprefix(f"{each.output.name} ")) for each in of_outputs),
         Fact("minimum inter-event time", f"{_number(1e3 * (certificate.inter_event_s or 0.0))} ms"),
         Fact("bound of ‖e_c‖", certificate.formula("‖e_c‖", "e_c")),
         Fact("bound of ‖x‖", certificate.formula("‖x‖", "x")),

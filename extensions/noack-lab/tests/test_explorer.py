@@ -54,14 +54,29 @@ def test_a_loop_that_is_unstable_says_why_and_is_drawn() -> None:
     assert "a mode of the loop grows" in repr(explorer)
     norm = explorer.run.values("‖x‖ plant")
     assert norm[-1] > norm[0]
-    assert len(explorer.figure("V").axes) == 4
+    assert len(explorer.figure("V").axes) == 6
 
 
 def test_a_plant_that_is_not_linear_is_simulated_in_virtual_time_with_the_reason() -> None:
     run = noack_lab.explore("dc_motor", {"horizon_s": 0.2}).run
     assert run.kind == results.SIMULATED
     assert "not given by matrices" in run.note
-    assert len(run.verdict) == 3
+    assert run.note.startswith("in virtual time; an exact run is not possible: ")
+    assert run.verdict[0].text.startswith("shaft_angle was ")
+
+
+def test_distances_from_a_reference_are_drawn_with_the_bounds_about_it() -> None:
+    explorer = noack_lab.explore("servo_reference", {"horizon_s": 6.0})
+    bounds = {curve.panel: curve for curve in explorer.certificate.curves}
+    for name in ("‖x − x_r‖ plant", "angle"):
+        (curve,) = (curve for curve in explorer.run.curves if curve.name == name)
+        bound = bounds[curve.panel]
+        assert np.all(curve.values <= np.interp(curve.t_s, bound.t_s, bound.values) * 1.001)
+        assert curve.values[-1] < 0.02  # the angle itself is at 1.5 then
+    facts = dict(explorer.certificate.facts)
+    assert facts["angle"].startswith("stays within 0.15 rad of its reference from ")
+    titles = [title["text"] for title in chart_options(Drawn(explorer.run, ""))["title"]]
+    assert "|angle − r| [rad] (logarithmic)" in titles
 
 
 def test_a_recorded_run_has_its_loops_and_its_bounds(tmp_path: Path) -> None:
@@ -78,13 +93,16 @@ def test_the_chart_has_a_panel_for_each_quantity_and_is_json() -> None:
     run, before = explorer.run, noack_lab.explore("lane_following", {"horizon_s": 2.0}).run
     options = chart_options(Drawn(run, "psi", explorer.certificate.curves, before))
     titles = [title["text"].split(" (")[0] for title in options["title"]]
-    assert titles == ["psi", "error norms", "norm of the state", "inter-event time [s]"]
+    assert titles == [
+        "psi [rad]", "|lateral offset| [m]", "|heading| [rad]", "error norms", "norm of the state",
+        "inter-event time [s]",
+    ]  # fmt: skip
     assert json.loads(json.dumps(options, allow_nan=False))["xAxis"][0]["max"] == 4.0
     series = {(part["name"], part["yAxisIndex"]): part for part in options["series"]}
-    drawn = np.array(series["‖x‖ plant", 2]["data"], float)
+    drawn = np.array(series["‖x‖ plant", 4]["data"], float)
     (curve,) = [curve for curve in run.curves if curve.name == "‖x‖ plant"]
     np.testing.assert_allclose(drawn, np.column_stack([curve.t_s, curve.values]), rtol=1e-5)
-    assert {("for comparison", 0), ("for comparison", 2), ("certified bound (computed)", 1)} <= {*series}
-    assert options["yAxis"][1]["type"] == "log"
-    reached = [value for _, value in series["‖e_s‖ sensor", 1]["data"] if value is not None]
+    assert {("for comparison", 0), ("for comparison", 4), ("certified bound (computed)", 3)} <= {*series}
+    assert options["yAxis"][3]["type"] == "log"
+    reached = [value for _, value in series["‖e_s‖ sensor", 3]["data"] if value is not None]
     assert min(reached) > 0  # it is 0 after a reset, which is a gap

@@ -22,24 +22,65 @@ _SHARES = (1.0, 0.5, 0.2, 0.0)
 """Rates that are tried, in multiples of the largest one."""
 _FIRST_S, _NEARLY, _STEPS = 1e-6, 0.98, 12
 """A time between events is accepted if e_s reaches nearly the threshold."""
+_AVERAGED = 2.0 ** np.arange(-8, 5)
+"""Times over which an integral of the error is averaged, in time constants of the loop."""
 _SLACK = 1e-10
 """Of the quadratic form of a rule, relatively, in the inequality of what a silent test says."""
 
 
 def find_gains(loop: Loop, rate: float, outputs: Sequence[str]) -> dict[str, object]:
-    """Return the table "gains" of a document with a rate.
+    """Return the table "gains" of a document with a rate, that with the smallest bounds.
 
     Raises:
         NoWitnessError: nothing is proven by gains at this rate.
     """
+    found: list[tuple[float, dict[str, object]]] = []
+    reason = NoWitnessError("nothing is tried")
+    for taken in _rules_taken(loop):
+        try:
+            table, gains = _gains(loop, rate, outputs, taken)
+        except NoWitnessError as error:
+            reason = error
+            continue
+        decaying, constant = gains.bounds[outputs[0]]
+        found.append((float(decaying + constant), table))
+    if not found:
+        raise reason
+    return min(found, key=lambda pair: pair[0])[1]
+
+
+def _rules_taken(loop: Loop) -> Iterator[dict[str, object]]:
+    """Yield what a table says about the rule for which that of the loop is taken."""
+    if loop.times.longest > 0:
+        yield {"by_time": True}
+    if not loop.rule.integrates:
+        yield {}
+        return
+    fastest = float(np.abs(np.linalg.eigvals(floats(loop.A + loop.B * loop.gain))).max()) or 1.0
+    windows = (_AVERAGED / fastest).tolist()
+    if not loop.times.sampling > 0:
+        yield from ({"window_s": window} for window in windows)
+        return
+    sampling = float(loop.times.sampling.p) / float(loop.times.sampling.q)
+    yield from (
+        {"tests": tests} for tests in sorted({max(round(window / sampling), 1) for window in windows})
+    )
+
+
+def _gains(
+    loop: Loop, rate: float, outputs: Sequence[str], taken: dict[str, object]
+) -> tuple[dict[str, object], Gains]:
+    """Return a table with a rate, and what it proves; see :func:`find_gains`."""
+    is_periodic = loop.times.period > 0 or "by_time" in taken
     table: dict[str, object] = {
+        **taken,
         "inputs": np.linalg.svd(floats(loop.gain))[0].T.tolist(),
         "outputs": list(dict.fromkeys(outputs)),
         "plant": _lyapunov(floats(loop.A + loop.B * loop.gain), rate, "A + BK"),
     }
-    if loop.losses and not loop.times.period > 0 and (rate or not loop.holds):
+    if loop.losses and not is_periodic and (rate or not loop.holds):
         table["model"] = _lyapunov(floats(loop.H), rate, "the model")
-    if not loop.times.period > 0 and own_comparison(loop) is None:
+    if not is_periodic and own_comparison(loop) is None:
         table["comparison"] = _comparison(loop)
     try:
         gains = Gains(loop, number(rate), table)
@@ -47,7 +88,7 @@ def find_gains(loop: Loop, rate: float, outputs: Sequence[str]) -> dict[str, obj
         raise NoWitnessError(str(error)) from None
     if compares_error(loop) and not loop.rule.always:
         table["inter_event_s"] = _inter_event_s(gains)
-    return table
+    return table, gains
 
 
 def find_by_gains(loop: Loop, outputs: Sequence[str]) -> dict[str, object]:

@@ -57,6 +57,19 @@ def test_there_is_no_steady_state_error_under_a_load() -> None:
     assert np.abs(angles[1] - 0.3 / 11.75).max() < 0.003
 
 
+def test_its_margin_is_that_of_the_augmented_matrices() -> None:
+    periodic = {"trigger": {"policy": "periodic", "period_s": 0.1}, "plant": {"initial_state": [0.5, 0.0]}}
+    A, B = augmented(np.array([[0.0, 1.0], [0.0, -2.0]]), np.array([[0.0], [4.0]]), np.array([[1.0, 0.0]]))
+    by_hand = {
+        "model": {"A": A.tolist(), "B": B.tolist(), "gain": GAIN},
+        "plant": {"initial_state": [0.5, 0.0, 0.0]},
+    }
+    margins = [noack.margin(noack.load({**LOOP, **periodic, **more}), most_m=4, period=False).to_json()
+               for more in ({}, by_hand)]  # fmt: skip
+    assert margins[0] == margins[1]
+    assert margins[0]["every_m"] or margins[0]["stable_m"]
+
+
 def test_a_file_with_loops_has_it_in_each() -> None:
     """One loop has its own gain, another one no integral."""
     loops = [{"name": "one"}, {"name": "two", "model": {"integral": "angle", "gain": [[-6.0, -1.2, 4.0]]}}]

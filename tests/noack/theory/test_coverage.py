@@ -56,7 +56,12 @@ def test_changes_are_refused_before_a_run_and_not_in_it() -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        ("description='another text'", "model.state_names=['p', 'v']", "speed=2.0", "start_within_s=9.0"),
+        (
+            "description='another text'",
+            "model.state_names=['position','v']",
+            "speed=2.0",
+            "start_within_s=9.0",
+        ),
         ("plant.disturbances.0.hz=9.0", "plant.disturbances.0.phase_rad=1.0"),
         ("network.limit=50", "network.encrypted=true", "controller.timeout_input=safe"),
         ("realtime.enabled=false", "clocks={largest_error_us=50.0}", "ports.sensor=4000"),

@@ -150,6 +150,15 @@ def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: 
     assert states.read_text().count('width="720pt"') == 1
 
 
+@pytest.mark.parametrize("name", ["servo_reference", "dc_motor_load"])
+def test_the_norm_is_the_distance_that_is_bounded(name: str) -> None:
+    """About a reference, or where the loop rests under its load: x itself is at 1.6, and the load at 0.2."""
+    run = noack.simulate(name)
+    (norm,) = (curve for curve in run.curves() if curve.name == "‖x − x_r‖ plant")
+    assert norm.values[-1] < 0.02
+    assert "from its re" in run._describe("state-norm").caption
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_the_curves_of_a_run_are_those_of_its_figures(case: str) -> None:
     record = CASES[case]()

@@ -137,6 +137,13 @@ class Servo:
 """
 
 
+def test_states_are_named_by_a_class_that_does_not_name_its_inputs() -> None:
+    Path("servo.py").write_text(SERVO.replace('    inputs = ["voltage, V"]\n', ""))
+    model = noack.linearise("servo.py")
+    assert model.plant.names == (("angle", "rate"), None)
+    assert (model.plant.m, model.plant.units) == (1, ("rad", "rad/s"))
+
+
 def test_one_command_leads_from_a_class_to_a_guarantee_in_its_own_units() -> None:
     Path("servo.py").write_text(SERVO)
     first, *_ = command("new", "servo.py").stdout.splitlines()

@@ -27,7 +27,7 @@ BURSTS = {"model": "gilbert_elliott", "good_to_bad": 0.3, "bad_to_good": 0.4, "l
 def scenario(**settings: object) -> Scenario:
     timing = {"plant.rate_hz": 40.0, "controller.rate_hz": 40.0, "horizon_s": 1.5}
     trigger = {"policy": "periodic", "period_s": 0.25}
-    settings = {**timing, "trigger": trigger, "certificate.late_periods": 0, **settings}
+    settings = {**timing, "trigger": trigger, "certificate.late_periods": 0, "outputs": None, **settings}
     return resolve(noack.load("double_integrator", settings=settings))
 
 

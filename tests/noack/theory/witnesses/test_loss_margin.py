@@ -11,15 +11,14 @@ from scipy.linalg import expm
 from cosim.simulation.virtual_time import simulate
 from noack.core.linear_systems import Vector
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
-from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import load
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.loss_margin import LossMargin
 from noack_check.growth import Burst, PeriodicLoop
 from tests.helpers.approved import compare_lines, lines_of_error
+from tests.helpers.shipped import resolved
 
-ROOT = Path(__file__).parents[4]
 PERIODIC = 'trigger={policy="periodic", period_s=0.0997}'
 DWELL = '{policy="dwell", interval_s=0.11, rule={policy="absolute", delta=1}}'
 DEADLINE = f'{{policy="deadline", interval_s=0.3, rule={DWELL}}}'
@@ -43,8 +42,7 @@ def late(seconds: float) -> str:
 
 
 def scenario(name: str, *settings: str) -> Scenario:
-    settings = (PERIODIC, "network.mansd=20", *settings)
-    return resolve(load(ROOT / "scenarios" / f"{name}.toml", settings))
+    return resolved(name, PERIODIC, "network.mansd=20", *settings)
 
 
 @pytest.mark.parametrize(
