@@ -59,9 +59,10 @@ def certificates_under(
 ) -> list[ScenarioCertificate]:
     """Return the certificates of a resolved scenario, where its times are at least those of some conditions.
 
-    They hold until a setting on which they depend, or a load, first changes.
+    They hold until a setting on which they depend, or a load, first changes, and until the plant first
+    applies an input of the watchdog, or a safe one: the run shows when.
     """
-    scenario = with_constant_load(scenario)
+    scenario = _with_inputs_of_controller(with_constant_load(scenario))
     if not scenario.certificate.prove:
         most_work = 0.0
     times_s = {"delay": conditions.delay_s, "age": conditions.hold_s, "start": conditions.start_s}
@@ -74,3 +75,15 @@ def certificates_under(
         )
         for plants in plants_of(scenario)
     ]
+
+
+def _with_inputs_of_controller(scenario: Scenario) -> Scenario:
+    """Return a scenario whose plant applies nothing but K x_c, and 0 before the first input."""
+    plant = scenario.plant
+    watchdog = plant.watchdog.model_copy(update={"policy": "hold"})
+    return scenario.model_copy(
+        update={
+            "plant": plant.model_copy(update={"watchdog": watchdog}),
+            "controller": scenario.controller.model_copy(update={"safe_input": None}),
+        }
+    )
