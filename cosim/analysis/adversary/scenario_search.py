@@ -109,6 +109,14 @@ def find_worst(
         return find(resolved, objective, certificate, beam, most_nodes, report)
 
 
+def require_searchable(resolved: Scenario, *, continuous: bool) -> None:
+    """Raise CallerError unless a scenario can be searched."""
+    if continuous:
+        continuous_loop_of(resolved)
+    else:
+        SampledLoop(resolved)
+
+
 def _find_sampled(
     resolved: Scenario,
     objective: Objective,

@@ -168,7 +168,7 @@ def print_worst(
         is_lower = worst.objective is Objective.INTER_EVENT
         certified = at_least(worst.certified) if is_lower else at_most(worst.certified)
         table.add_row(
-            _quantity(worst.objective, certificate, trigger),
+            _quantity(worst.objective, certificate, trigger, weighted=resolved.trigger.weight is not None),
             *(number(value, 4) for value in (worst.lossless, worst.with_own_network, worst.value)),
             certified,
             "[bold red]exceeded[/]" if worst.breaches else _share_used(worst.tightness),
@@ -217,13 +217,13 @@ def _notes(resolved: Scenario, trigger: str) -> Iterator[str]:
         yield f"[dim]Every delivered update takes the longest delay that is certified, {longest}[/]"
 
 
-def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str) -> str:
+def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str, *, weighted: bool) -> str:
     sampled = trigger == "sampled"
     rate = 0.0 if certificate.proven is None else certificate.proven.rate_per_s
     growth = f" e^({rate:.3g}t)" if rate else ""
     if sampled and _is_shaped(certificate):
         growth = ", scaled"
-    error = "‖W e_c‖"
+    error = "‖W e_c‖" if weighted else "‖e_c‖"
     return {
         Objective.ERROR: f"{error}{growth}" if sampled else f"Δ: {error}{growth} / β",
         Objective.STATE: f"‖x‖{growth}" if sampled else f"X: ‖x‖{growth}",

@@ -11,9 +11,10 @@ from cosim.analysis.witnesses import find_statement, plants_of
 from noack.core.clock import NS_PER_S
 from noack.scenario.loads import with_constant_load
 from noack.scenario.scenario import Scenario
+from noack.settings.section import Table
 from noack.theory.certificates.assumptions import Assumption, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import NetworkConditions, allowed_conditions
+from noack.theory.certificates.conditions import NetworkConditions, allowed_conditions, certified_delay_s
 
 _FEW_LOOPS = 4
 RUN_WORK = 2.5
@@ -62,7 +63,7 @@ def certificates_under(
     They hold until a setting on which they depend, or a load, first changes, and until the plant first
     applies an input of the watchdog, or a safe one: the run shows when.
     """
-    scenario = _with_inputs_of_controller(with_constant_load(scenario))
+    scenario = _checked_by_run(with_constant_load(scenario))
     if not scenario.certificate.prove:
         most_work = 0.0
     times_s = {"delay": conditions.delay_s, "age": conditions.hold_s, "start": conditions.start_s}
@@ -77,13 +78,19 @@ def certificates_under(
     ]
 
 
-def _with_inputs_of_controller(scenario: Scenario) -> Scenario:
-    """Return a scenario whose plant applies nothing but K x_c, and 0 before the first input."""
-    plant = scenario.plant
+def _checked_by_run(scenario: Scenario) -> Scenario:
+    """Return a scenario without what a run checks itself: delays, and inputs that are not the controller's.
+
+    Where the delay in a queue is not known, it stays so.
+    """
+    plant, network = scenario.plant, scenario.network
     watchdog = plant.watchdog.model_copy(update={"policy": "hold"})
-    return scenario.model_copy(
-        update={
-            "plant": plant.model_copy(update={"watchdog": watchdog}),
-            "controller": scenario.controller.model_copy(update={"safe_input": None}),
-        }
-    )
+    update: Table = {
+        "plant": plant.model_copy(update={"watchdog": watchdog}),
+        "controller": scenario.controller.model_copy(update={"safe_input": None}),
+    }
+    if not network.link.queues or scenario.certificate.network_delay_s is not None:
+        stated = {"network_delay_s": float(certified_delay_s(scenario))}
+        update["certificate"] = scenario.certificate.model_copy(update=stated)
+        update["network"] = network.model_copy(update={"impairments": ()})
+    return scenario.model_copy(update=update)

@@ -196,6 +196,8 @@ def adversary(
     if continuous:
         warn_of_left_out(resolved)
     by_runs = not continuous and not resolved.coverage.is_linear
+    if not by_runs:
+        adversary_search.require_searchable(resolved, continuous=continuous)
     certificate = _certificate_to_compare(resolved, ideal=continuous)
     if by_runs and not certificate.exists:
         raise CallerError(f"no certificate: {certificate.void}")
