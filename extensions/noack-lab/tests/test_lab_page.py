@@ -41,7 +41,7 @@ def test_dragging_changes_run_figure_and_text_and_is_compared_with_before(open_p
     page.wait(row("lost", "0 (0 %)"))
     page.wait(f"{CURVE} !== {json.dumps(picture)}")
     page.click("all settings (TOML)")
-    scrolled = "document.querySelector('.cm-scroller').scrollTop = 400"  # the editor has visible lines only
+    scrolled = "[...document.querySelectorAll('.cm-line')].at(-1)?.scrollIntoView()"  # the editor has visible lines only
     page.wait(f"({scrolled}, {TEXT}.includes('probability = 0.0'))")
     page.click("keep for comparison")
     page.drag("maximum consecutive losses", 1.0)
