@@ -29,13 +29,6 @@ def test_units_move_to_the_heads() -> None:
     assert result_tables.as_csv(rows) == "quantity,value\ndelay [ms],3\nlost,3 (60 %)\n"
 
 
-def test_marks_of_proven_numbers_have_columns_of_their_own() -> None:
-    table = result_tables.ResultTable("t", "c", ("", "plant", "box"), [("x", "1.2✓", "3"), ("e", "–", "2✓")])
-    assert result_tables.as_csv(table) == (
-        ',plant,"plant, proved",box,"box, proved"\nx,1.2,yes,3,\ne,,,2,yes\n'
-    )
-
-
 def test_tables_of_a_run_have_its_numbers(tmp_path: Path) -> None:
     simulated = noack.simulate(noack.load("lane_following", {"horizon_s": 4.0}))
     result_tables.save_tables(summary_tables(simulated.summary), tmp_path)
