@@ -23,9 +23,9 @@ def save_tables(result: Result, folder: str | PathLike[str]) -> list[Path]:
 
     >>> import noack, tempfile
     >>> folder = tempfile.TemporaryDirectory()
-    >>> files = noack.save_tables(noack.certify("lane_following", proofs=False), folder.name)
+    >>> files = noack.save_tables(noack.certify("lane_following", search=False), folder.name)
     >>> [file.name for file in files]
-    ['certificates.csv', 'limits.csv']
+    ['certificates.csv']
     >>> folder.cleanup()
 
     Args:

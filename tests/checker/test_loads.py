@@ -64,7 +64,7 @@ def test_a_loop_with_a_reference_is_read_about_its_rest_and_the_reference() -> N
     assert floats(loop.start)[:, 0] == pytest.approx([0.5, 0.0, 0.0])
     assert loop.push_before_input is not None  # the motor rests at 0.5 rad without a voltage
     assert floats(loop.push_before_input)[:, 0] == pytest.approx([0.0, 309.75 * 0.2, 0.0])
-    assert loop.until == 4  # the run ends
+    assert loop.until is None  # it is a set-point
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def test_bounds_are_near_what_is_simulated(witness: Witness) -> None:
 @pytest.mark.parametrize("floor", [0.0, 0.01])
 def test_ideal_conditions_give_smaller_bounds(witness: Witness, floor: float) -> None:
     ideal = bounds_of(find_witness(double_integrator(IDEAL, floor=floor)))
-    assert ideal["e_s"] == pytest.approx(math.hypot(0.05, floor))
+    assert ideal["e_s"] <= math.hypot(0.05, floor) * (1 + 1e-6)
     assert ideal["x"] < bounds_of(witness)["x"] + floor
 
 

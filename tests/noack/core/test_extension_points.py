@@ -92,15 +92,14 @@ def test_certificates_cover_no_disturbance_and_no_policy_of_a_package(tmp_path: 
     gust = 'plant.disturbances=[{kind="gust", amplitude=[1.0]}]'
     policy = 'trigger={policy="impatient", delta=0.1}'
     program = (
-        "import sys; from noack.theory.coverage import refusals; from tests.helpers.shipped import resolved; "
-        "print(*refusals(resolved('double_integrator', *sys.argv[1:])), sep='\\n')"
+        "import sys; from noack_check.keys import refusals; from tests.helpers.shipped import resolved; "
+        "print(*refusals(dict(resolved('double_integrator', *sys.argv[1:]).content())), sep='\\n')"
     )
     output, warnings = run(tmp_path, "-c", program, gust, policy)
     assert warnings == []
     assert output.splitlines() == [
-        'plant.disturbances.kind = "gust": no bound of this kind of disturbance is known',
-        'trigger.policy = "impatient": it is none of noack\'s rules; a class of your own '
-        "decides at measurements only",
+        'plant.disturbances.kind = "gust": this disturbance has no bound',
+        'trigger.policy = "impatient": this policy is not covered',
         "trigger.patience_s: no statement covers this key",
     ]
 
