@@ -579,8 +579,10 @@ class _TrialScenarios:
     def certify(self, trial: _Trial) -> ScenarioCertificate:
         """Return the certificate of a trial's linear plant that needs no search, perhaps void."""
         resolved = resolve(self.scenario(trial))
-        linear = resolved.plant.model_copy(update={"system": LinearSettings()})
-        resolved = resolved.model_copy(update={"plant": linear})
+        if not resolved.coverage.is_linear:
+            A, B = (tuple(map(tuple, M.tolist())) for M in resolved.model.matrices)
+            linear = {"system": LinearSettings(), "draw": "given", "A": A, "B": B}
+            resolved = resolved.model_copy(update={"plant": resolved.plant.model_copy(update=linear)})
         resolved.coverage.require_unchanging()
         require_linear(resolved)
         return quick_certificate(resolved)
