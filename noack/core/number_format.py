@@ -61,16 +61,6 @@ def _bound(value: float | None, digits: int, decimals: int | None, rounding: str
     return f"{float(rounded):.{digits}g}" if decimals is None else f"{rounded:.{decimals}f}"
 
 
-def apart_from(limit: float, value: float) -> str:
-    """Write a number with the fewest digits, at least 3, that show on which side of a limit it is."""
-
-    def side(of: float) -> int:
-        return (of > limit) - (of < limit)
-
-    texts = (f"{value:.{digits}g}" for digits in range(3, 18))
-    return next(text for text in texts if side(float(text)) == side(value))
-
-
 def whole(value: float | None) -> str:
     """Write a number without decimals."""
     return NONE if value is None else f"{value:.0f}"

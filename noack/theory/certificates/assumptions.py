@@ -17,6 +17,7 @@ from noack.scenario.estimation import SteadyState, steady_state
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import NetworkConditions, network_delay_text
+from noack.theory.certificates.normal_values import normal_limit
 
 _NOT_COVERED = "not covered by the theorems and the certificates"
 _NOT_BY_THEOREMS = "not covered by the theorems"
@@ -256,7 +257,14 @@ def certificate_assumptions(
     checked = _conditions(conditions, resolved, probability)
     if not resolved.coverage.is_undisturbed:
         assumed, source = "disturbances and noise stay within their bounds", "certificate"
-        checked.append(Assumption(assumed, source, AssumptionStatus.HOLDS, "by their settings"))
+        status, why = AssumptionStatus.HOLDS, "by their settings"
+        if (limit := normal_limit(resolved)) is not None:
+            status = AssumptionStatus.ASSUMED
+            why = (
+                f"normal values have no bound; {limit:.3g} standard deviations are assumed, and a run "
+                f"exceeds one with a probability of at most {resolved.certificate.exceedance_probability:g}"
+            )
+        checked.append(Assumption(assumed, source, status, why))
     return checked
 
 

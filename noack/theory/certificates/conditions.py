@@ -22,6 +22,7 @@ from noack.references.segment import SolutionSegment
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows, Table
+from noack.theory.certificates.normal_values import normal_limit, with_bounded_values
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
@@ -146,8 +147,9 @@ def with_stated_numbers(resolved: Scenario) -> Scenario:
     """Return a resolved scenario with numbers in place of what follows from other keys.
 
     These are the network delay that certificates allow for, the watchdog's timeout, and the input of a
-    set-point, which becomes a constant reference; their effect stays the same. The delay in a queue is not
-    known: if it is not stated, it stays so.
+    set-point, which becomes a constant reference; their effect stays the same. In the place of normally
+    distributed values there are those within the bounds that a run keeps but for a small probability. The
+    delay in a queue is not known: if it is not stated, it stays so.
     """
     update: Table = {}
     if not resolved.network.link.queues:
@@ -155,7 +157,7 @@ def with_stated_numbers(resolved: Scenario) -> Scenario:
         update["certificate"] = resolved.certificate.model_copy(update=stated)
     timeout_s = resolved.timing.actuation_timeout_ns / NS_PER_S
     watchdog = resolved.plant.watchdog.model_copy(update={"timeout_s": timeout_s})
-    update["plant"] = resolved.plant.model_copy(update={"watchdog": watchdog})
+    update["plant"] = with_bounded_values(resolved).model_copy(update={"watchdog": watchdog})
     if (setpoint := setpoint_of(resolved)) is not None:
         states = resolved.model.followed_states
         (segment,) = Reference.constant(setpoint[0][:states], setpoint[1]).segments
@@ -214,16 +216,19 @@ def kept_probability(
 ) -> float | None:
     """Bound the probability that a run's losses keep a guarantee that nothing enforces.
 
-    Until the first loss too many, events are at least ``inter_event_s`` apart. None: there is no such
-    bound, or the losses are no Markov chain over the packets.
+    Until the first loss too many, events are at least ``inter_event_s`` apart, but for runs whose normal
+    values exceed their bounds. None: there is no such bound, or the losses are no Markov chain over the
+    packets.
     """
     if not inter_event_s:
         return None
     try:
         losses = loss_process(resolved.network.link)
-        return losses.keeps(guarantee, most_events(resolved, inter_event_s))
+        kept = losses.keeps(guarantee, most_events(resolved, inter_event_s))
     except NotPredictableError:
         return None
+    excluded = 0.0 if normal_limit(resolved) is None else resolved.certificate.exceedance_probability
+    return max(kept - excluded, 0.0)
 
 
 def about_reference(resolved: Scenario) -> Scenario:
