@@ -112,7 +112,7 @@ def find_worst(
 def require_searchable(resolved: Scenario, *, continuous: bool) -> None:
     """Raise CallerError unless a scenario can be searched."""
     if continuous:
-        continuous_loop_of(resolved)
+        measure_of(continuous_loop_of(resolved), Objective.STATE)
     else:
         SampledLoop(resolved)
 

@@ -177,7 +177,6 @@ def test_a_run_of_the_largest_number_of_events_keeps_the_assumption_as_often_as_
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["lane_periodic"], "gains: "),
         (
             ["unstable_pendulum", "--set=model.gain=[[15.0, 5.0]]", "--set=model.allow_unstable=true"],
             "the loop's u is +Kx, and −K would stabilise it",
