@@ -188,11 +188,12 @@ def test_the_sensor_error_before_the_first_input_is_bounded() -> None:
 
 
 def test_the_first_event_may_come_earlier_than_others_do() -> None:
-    found = find_witness(early(0.05))
-    assert found.proof.first_event is not None
-    assert found.proof.inter_event is not None
-    assert found.proof.first_event < found.proof.inter_event
-    changed = {**found.document, "first_event_s": found.document["inter_event_s"]}
+    by_forms = {name: part for name, part in find_witness(early(0.05)).document.items() if name != "gains"}
+    proof = prove(early(0.05), by_forms)
+    assert proof.first_event is not None
+    assert proof.inter_event is not None
+    assert proof.first_event < proof.inter_event
+    changed = {**by_forms, "first_event_s": by_forms["inter_event_s"]}
     rejects(early(0.05), changed, "first_event_s")
 
 
