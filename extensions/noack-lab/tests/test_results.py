@@ -14,7 +14,7 @@ def test_the_lab_gives_the_answer_of_certify() -> None:
 
 
 def test_bounds_with_a_floor_or_disturbances_do_not_decay_to_zero() -> None:
-    for name, stays in (("lane_following", False), ("unstable_pendulum", True), ("pendulum_observed", True)):
+    for name, stays in (("lane_following", False), ("unstable_pendulum", True), ("servo_reference", True)):
         text = guarantee_of(noack.load(name)).line.text
         assert "all errors decay at" in text
         assert ("to a bound that does not decay" in text) == stays
@@ -22,4 +22,4 @@ def test_bounds_with_a_floor_or_disturbances_do_not_decay_to_zero() -> None:
 
 def test_a_setting_without_a_certificate_is_the_reason_once() -> None:
     text = guarantee_of(noack.load("model_predictive")).line.text
-    assert text == 'no certificate: controller.kind = "python": u is not K x_c'
+    assert text == 'no certificate: controller.kind = "python": the input is not K x_c'

@@ -24,7 +24,7 @@ from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES
-from noack.theory.coverage import refusal
+from noack.theory.coverage import nonlinear_because
 from noack.trigger_policies.lyapunov import LyapunovSettings
 from noack.trigger_policies.policy_settings import ModelMatrices
 from tests.helpers.approved import compare_lines, lines_of_error
@@ -116,7 +116,7 @@ def test_exact_and_batch_loops_refuse_a_user_trigger_in_one_line(tmp_path: Path)
         with pytest.raises(CallerError, match="decides at measurements only") as refused:
             refuses(resolved)
         assert "\n" not in str(refused.value)
-    assert (refusal(resolved) or "").endswith("a class of your own decides at measurements only")
+    assert (nonlinear_because(resolved) or "").endswith("a class of your own decides at measurements only")
     rule = '{policy="python", name="a:B"}'
     with pytest.raises(CallerError, match='"python" cannot be combined'):
         load(
