@@ -77,6 +77,7 @@ from noack_check.responses import Decay, Response, norm_of, responses, responses
 
 Form = Mapping[str, arb]
 """Σ coefficient · signal, by the signals' names; "1" is the constant 1."""
+_NO_BOUND = "gains: too large for a bound"  # the spectral radius of F is not proven to be below 1
 _ROOM = 1e-9
 """By so much, relatively, y exceeds the solution of y = Fy + g."""
 _MOST_TESTS = 1_000_000
@@ -434,7 +435,7 @@ class UnitGains:
                 break
             y, slope = smaller, following
         if not self._compared(y["share"]) < y["compared"]:
-            raise RejectedError("gains: the comparison has no bound by them")
+            raise RejectedError(_NO_BOUND)
         return y
 
     def _solution_at(self, slope: arb) -> dict[str, arb]:
@@ -447,7 +448,7 @@ class UnitGains:
             if not failing:
                 return y
             chosen |= dict(failing)
-        raise RejectedError(f"gains: {failing[0][0]} has no bound by them")
+        raise RejectedError(_NO_BOUND)
 
 
 def _sum(*terms: tuple[arb, Form]) -> Form:
@@ -479,11 +480,10 @@ def _solved(rows: Mapping[str, Form]) -> dict[str, arb]:
             arb_mat(len(names), 1, [((1 + _ROOM) * each + room).mid() for each in right])
         )
     except ZeroDivisionError:
-        raise RejectedError("gains: the inequalities have no solution") from None
+        raise RejectedError(_NO_BOUND) from None
     found = {name: arb(y[i, 0].mid()) for i, name in enumerate(names)}
-    for name, size in found.items():
-        if not size > 0:
-            raise RejectedError(f"gains: {name} has no bound by them")
+    if not all(size > 0 for size in found.values()):
+        raise RejectedError(_NO_BOUND)
     return found | {"1": arb(1)}
 
 

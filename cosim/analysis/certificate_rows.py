@@ -19,13 +19,18 @@ def covered_plants(certificate: ScenarioCertificate) -> str:
 
 
 def certificate_rows(
-    certificates: Sequence[ScenarioCertificate], outputs: Sequence[Sequence[OutputBound]]
+    certificates: Sequence[ScenarioCertificate],
+    outputs: Sequence[Sequence[OutputBound]],
+    state_norm: str = "‖x‖",
 ) -> Iterator[Row]:
-    """Yield the rows. ``outputs``: the bounds of each certificate's outputs, without any none."""
+    """Yield the rows. ``outputs``: the bounds of each certificate's outputs, without any none.
+
+    ``state_norm``: the name of what bounds of the state are about.
+    """
     if not any(certificate.exists for certificate in certificates):
         yield "certificate", [_VOID] * len(certificates)
         return
-    for quantity, label in _QUANTITIES.items():
+    for quantity, label in (_QUANTITIES | {"x": state_norm}).items():
         if any(certificate.has(quantity) for certificate in certificates):
             yield f"{label} ≤", [_bound(certificate, quantity) for certificate in certificates]
     for index in range(max(map(len, outputs), default=0)):

@@ -266,7 +266,7 @@ class Certificates:
     def _rows(self) -> TextRows:
         heads = [f"{under}, {covered_plants(certificate)}" for under, certificate in self]
         outputs = [self.stated_bounds(certificate) for _, certificate in self]
-        rows = certificate_rows([certificate for _, certificate in self], outputs)
+        rows = certificate_rows([certificate for _, certificate in self], outputs, state_norm(self))
         return [[self.scenario.name, *heads], *([label, *values] for label, values in rows)]
 
     def __repr__(self) -> str:
@@ -274,6 +274,11 @@ class Certificates:
 
     def _repr_html_(self) -> str:
         return as_html(self._rows())
+
+
+def state_norm(results: Certificates) -> str:
+    """Return what bounds of the state are about: ‖x‖, or the distance from a set-point or reference."""
+    return "‖x − x_r‖" if any(results.setpoint or ()) or results.follows_reference else "‖x‖"
 
 
 def theorem_2_of(scenario: Scenario, ideal: ScenarioCertificate | None) -> Theorem2 | None:

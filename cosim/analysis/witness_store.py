@@ -1,8 +1,9 @@
 """Witnesses that were found earlier, in the user's cache folder: a search takes seconds, a check 0.3 s.
 
 Nothing that is stored is believed: the checker proves each document again, for the loop at hand. A file
-that is damaged, or another user's, counts as missing. That a search found nothing is stored, too; this
-counts for the same version of noack and searches that are not longer.
+that is damaged, or another user's, counts as missing. What is stored counts for searches that are not
+longer: the short search of a run may find larger bounds. That a search found nothing is stored, too; this
+counts for the same version of noack.
 """
 
 import hashlib
@@ -32,8 +33,6 @@ class StoredSearch(NamedTuple):
     document: Mapping[str, object] | None
     reason: str = ""
     """Why there is no witness."""
-    bounded: Sequence[str] = ()
-    """The outputs that are bounded."""
 
 
 class WitnessStore:
@@ -55,10 +54,11 @@ class WitnessStore:
             if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
                 return None
             content = json.loads(file.read(_MOST_BYTES))
-            as_long = {*wanted} <= {*content["wanted"]} and content["most_work"] >= most_work
-            if content["document"] is not None and (as_long or {*wanted} <= {*content["bounded"]}):
+            if not ({*wanted} <= {*content["wanted"]} and content["most_work"] >= most_work):
+                return None
+            if content["document"] is not None:
                 return StoredSearch(content["document"])
-            if content["document"] is None and as_long and content["noack"] == version("noack"):
+            if content["noack"] == version("noack"):
                 return StoredSearch(None, str(content["reason"]))
         return None
 

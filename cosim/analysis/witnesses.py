@@ -326,10 +326,7 @@ def _known_or_found(
     except NoWitnessError as error:
         store.write(StoredSearch(None, str(error)), wanted, most_work)
         raise
-    # A longer search may find forms, too, where there are bounds by gains only.
-    bounds = witness.proof.bounds if "bounds" in witness.document else ()
-    bounded = [bound.output if bound.from_start else f"{bound.output} in the limit" for bound in bounds]
-    store.write(StoredSearch(witness.document, bounded=bounded), wanted, most_work)
+    store.write(StoredSearch(witness.document), wanted, most_work)
     return witness
 
 

@@ -8,7 +8,7 @@ largest settings and the assumptions, too; :func:`margin_document` has the margi
 from collections.abc import Iterable, Iterator, Sequence
 
 from cosim.analysis.certificate_rows import certificate_rows, covered_plants
-from cosim.analysis.certificates import IDEAL, SCHEDULE, Certificates
+from cosim.analysis.certificates import IDEAL, SCHEDULE, Certificates, state_norm
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.analysis.tried_settings import MOST_S, TriedSettings
@@ -61,10 +61,6 @@ def _all_tables(results: Certificates) -> Iterator[Block]:
     if (box := results.helpful_box) is not None:
         yield _prose(f"the box has one{_listed('', [box])}")
     yield from _regions(results)
-    if any(results.setpoint or ()) or results.follows_reference:
-        yield Sentence(
-            text="x is the distance from the set-point or reference, x − x_r.", role=SentenceRole.NOTE
-        )
     yield from _about_rest(results)
     if largest := _listed("the guarantee is kept", results.largest_settings):
         yield _prose(largest)
@@ -91,7 +87,7 @@ def _few_lines(results: Certificates) -> Iterator[Sentence]:
         for bound in [bound for bound in bounds if bound.output.allowed is not None][:_MOST_BOUNDS]:
             yield _prose(f"{bound.formula} (proved)")
         if results.scenario.outputs:  # else the first sentence has it
-            yield _prose(f"{certificate.formula('‖x‖', 'x')} (proved)")
+            yield _prose(f"{certificate.formula(state_norm(results), 'x')} (proved)")
         yield from _about_rest(results)
         apart_s = certificate.inter_event_s
         if apart_s is not None and apart_s < MOST_S:
@@ -164,7 +160,7 @@ def _in_words(results: Certificates) -> Iterator[str]:
             losses = f"as long as there are {meaning}, which nothing enforces"
         yield (
             f"In words: for {certificate.scope}, under the assumptions above and {losses}: "
-            f"{certificate.formula('‖x‖', 'x')} (proved).{apart}"
+            f"{certificate.formula(state_norm(results), 'x')} (proved).{apart}"
         )
 
 
@@ -207,7 +203,9 @@ def certificate_table(results: Certificates) -> ResultTable | None:
     headings = ["", *(f"{under},\n{covered_plants(certificate)}" for under, certificate in columns)]
     certificates = [certificate for _, certificate in columns]
     outputs = [results.stated_bounds(certificate) for certificate in certificates]
-    rows = [(label, *values) for label, values in certificate_rows(certificates, outputs)]
+    rows = [
+        (label, *values) for label, values in certificate_rows(certificates, outputs, state_norm(results))
+    ]
     return ResultTable("certificates", _title(results), headings, rows)
 
 

@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-from cosim.analysis.certificates import Certificates
+from cosim.analysis.certificates import Certificates, state_norm
 from noack.core.number_format import counted
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX
-from noack.theory.certificates.output_bounds import OutputBound
 
 _MOST_OUTPUTS = 4
 """Outputs without an allowed error that the sentence names."""
@@ -18,23 +17,20 @@ def guarantee_sentence(results: Certificates) -> str | None:
     certificate = results.guaranteed
     if certificate is None:
         return None
-    statements = _statements(
-        results.output_bounds(certificate), certificate, stated=results.scenario.outputs is not None
-    )
+    statements = _statements(results, certificate)
     plants = ", for every plant within the stated uncertainty" if certificate.scope == BOX else ""
     losses = although_lost(results.scenario)
     until = "" if results.jump_s is None else f", until the reference jumps at {results.jump_s:g} s"
     return f"{' and '.join(statements)}{until}{losses}{plants} (proved)"
 
 
-def _statements(
-    bounds: Sequence[OutputBound], certificate: ScenarioCertificate, *, stated: bool
-) -> Sequence[str]:
+def _statements(results: Certificates, certificate: ScenarioCertificate) -> Sequence[str]:
     """Return what is said of stated outputs: of those with an allowed error, or of few; else of ‖x‖."""
+    bounds, stated = results.output_bounds(certificate), results.scenario.outputs is not None
     asked = [bound for bound in bounds if bound.output.allowed is not None]
     if stated and (asked or len(bounds) <= _MOST_OUTPUTS):
         return [bound.statement for bound in asked or bounds]
-    return [certificate.formula("‖x‖", "x")]
+    return [certificate.formula(state_norm(results), "x")]
 
 
 def although_lost(scenario: Scenario) -> str:

@@ -350,7 +350,7 @@ def state(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) 
     """‖x‖ at each step of the plant."""
     if not certificate.has("x"):
         return ClaimBound()
-    formula = certificate.pattern("‖x‖", "x")
+    formula = certificate.pattern("‖x − x_r‖" if run.offset else "‖x‖", "x")
     values, slack = certificate.state(samples.step_s), ROUNDING * run.offset
     shares = upper_shares(row_norms(samples.plant.x), values + slack)
     void = run.violation_of(certificate)

@@ -280,7 +280,7 @@ class Claim(SummaryPart):
     @property
     def bounds_norm(self) -> bool:
         """Whether the bound is one of ‖e_c‖ or of ‖x‖."""
-        return self.bound.startswith(("‖e_c‖ ≤", "‖W e_c‖ ≤", "‖x‖ ≤"))
+        return self.bound.startswith(("‖e_c‖ ≤", "‖W e_c‖ ≤", "‖x‖ ≤", "‖x − x_r‖ ≤"))
 
     @property
     def is_lower_bound(self) -> bool:

@@ -28,11 +28,9 @@ def normal_limit(resolved: Scenario) -> float | None:
 
 def with_bounded_values(resolved: Scenario) -> PlantSection:
     """Return the plant of a resolved scenario with bounded values in the place of normal ones."""
-    plant, limit = resolved.plant, normal_limit(resolved)
-    if limit is None:
-        return plant
+    plant, limit = resolved.plant, normal_limit(resolved) or 0.0  # None: each standard deviation is 0
     measurement, noise_std = plant.measurement, plant.measurement.noise_std
-    if noise_std is not None:
+    if noise_std is not None and any(noise_std):
         known = measurement.noise_bound or (0.0,) * len(noise_std)
         bound = tuple(each + _above(limit, std) for each, std in zip(known, noise_std, strict=True))
         measurement = measurement.model_copy(update={"noise_std": None, "noise_bound": bound})

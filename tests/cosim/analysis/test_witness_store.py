@@ -109,6 +109,13 @@ def test_a_search_that_found_nothing_is_not_repeated_unless_it_may_be_longer(
     assert len(searches) == 2
 
 
+def test_a_short_search_does_not_count_for_a_longer_one(folder: Path, searches: list[float]) -> None:
+    """That of a run may find larger bounds, even where it finds all."""
+    for most_work in (2.0, 20.0, 2.0):
+        assert found(most_work=most_work).proof is not None
+    assert searches == [2.0, 20.0]
+
+
 def test_bounds_by_gains_alone_are_searched_again_if_the_search_may_be_longer(
     folder: Path, witness: Witness, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,6 +15,7 @@ from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.scenario_certificates import certificate_of
 from cosim.analysis.witnesses import WitnessedStatement, find_statement
 from cosim.output.certificate_report import certificate_document, certificate_table
+from cosim.output.document import Sentence
 from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate
 from noack.theory.certificates.conditions import allowed_conditions, most_events, outside_box
@@ -143,6 +144,20 @@ def test_a_set_point_is_certified_in_its_own_coordinates() -> None:
     assert moved.schedule.proven == zero.schedule.proven
     assert moved.schedule.exists
     assert moved.to_json()["setpoint"] == (3.0, 0.0)
+    for results, named in ((moved, "‖x − x_r‖ ≤ "), (zero, "‖x‖ ≤ ")):
+        for verbose in (False, True):
+            document = certificate_document(results, verbose=verbose)
+            texts = [block.text for block in document.blocks if isinstance(block, Sentence)]
+            assert any(named in text for text in texts)
+            assert not any("‖x‖ ≤ " in text for text in texts) or named == "‖x‖ ≤ "
+        assert named.strip() in repr(results)
+
+
+def test_a_claim_at_a_set_point_is_about_the_distance_from_it() -> None:
+    claims = RunClaims(simulate(resolved("double_integrator", "controller.setpoint=[3.0, 0.0]"))).evaluate()
+    bounds = [claim.bound for claim in claims if claim.source.endswith("certificate") and "‖x" in claim.bound]
+    assert bounds
+    assert all(bound.startswith("‖x − x_r‖ ≤ ") for bound in bounds)
 
 
 P = 0.05

@@ -38,6 +38,13 @@ def test_nothing_changes_without_normal_values() -> None:
     assert with_stated_numbers(scenario).plant.measurement == scenario.plant.measurement
 
 
+def test_a_normal_disturbance_without_size_is_none() -> None:
+    setting = 'plant.disturbances=[{kind="gaussian", std=[0.0]}]'
+    undisturbed = quick_certificate(resolved("double_integrator"))
+    assert undisturbed.exists
+    assert quick_certificate(resolved("double_integrator", setting)).proven == undisturbed.proven
+
+
 def test_runs_with_normal_values_keep_their_bounds_and_the_assumption_is_named() -> None:
     certificate = quick_certificate(resolved("double_integrator", *NORMAL))
     assert certificate.exists, certificate.void
