@@ -102,7 +102,7 @@ def test_the_chart_has_a_panel_for_each_quantity_and_is_json() -> None:
     drawn = np.array(series["‖x‖ plant", 4]["data"], float)
     (curve,) = [curve for curve in run.curves if curve.name == "‖x‖ plant"]
     np.testing.assert_allclose(drawn, np.column_stack([curve.t_s, curve.values]), rtol=1e-5)
-    assert {("for comparison", 0), ("for comparison", 4), ("certified bound (proved)", 3)} <= {*series}
+    assert {("for comparison", 0), ("for comparison", 4), ("certified bound", 3)} <= {*series}
     assert options["yAxis"][3]["type"] == "log"
     reached = [value for _, value in series["‖e_s‖ sensor", 3]["data"] if value is not None]
     assert min(reached) > 0  # it is 0 after a reset, which is a gap
