@@ -19,7 +19,7 @@ class CertificateSection(ScenarioSection):
     network_delay_s: Annotated[FiniteFloat, Field(ge=0, le=3600)] | None = None
     """The network may delay updates by this time; a longer delay voids the certificates. By default
     the longest delay of the network's impairments; with a queue, certificates need this key."""
-    exceedance_probability: Annotated[FiniteFloat, Field(gt=0, le=0.5)] = 1e-6
+    exceedance_probability: Annotated[FiniteFloat, Field(ge=1e-300, le=0.5)] = 1e-6
     """Normally distributed disturbances and noise have no bound. The certificates assume one that a
     run exceeds with at most this probability."""
     prove: bool = True

@@ -47,6 +47,13 @@ def test_a_loop_that_starts_at_rest_is_bounded() -> None:
     assert bound.settles_s == 0
 
 
+@pytest.mark.parametrize("size", [1e-300, 1e300])
+def test_states_of_any_size_have_bounds_without_a_warning(size: float) -> None:
+    """Squares of them overflow in the search."""
+    loop = double_integrator(level=0.05 * size)._replace(start=matrix([[size], [0.0]]))
+    assert 1 < bounds_of(find_witness(loop))["x"] / size < 20
+
+
 def test_without_a_finite_value_the_search_ends() -> None:
     tried: list[float] = []
 

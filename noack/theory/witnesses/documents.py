@@ -91,7 +91,8 @@ def find_witness(
     """
     wanted = _Wanted(outputs, ultimate, [document for document in near if "bounds" in document])
     try:
-        return _by_forms(loop, wanted, Effort(progress, most_work))
+        with np.errstate(over="ignore", invalid="ignore"):  # of huge states; the checker decides
+            return _by_forms(loop, wanted, Effort(progress, most_work))
     except NoWitnessError as error:
         with contextlib.suppress(NoWitnessError):
             return witness_by_gains(loop, wanted.by_gains)
