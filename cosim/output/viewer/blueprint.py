@@ -271,8 +271,9 @@ def _intervals() -> rrb.Container:
 
 def _norms(outputs: Sequence[LoopOutput]) -> rrb.Container:
     of_outputs = [plot(f"log10 |{output.name}|", output_path(output.name)) for output in outputs]
-    errors = plot("log10 ‖e‖", ERROR_LOG10), plot("‖e‖", ERROR)
-    return rrb.Tabs(*of_outputs, *errors, plot("log10 ‖x‖", SIZE_LOG10))
+    return rrb.Tabs(
+        plot("log10 ‖e‖", ERROR_LOG10), *of_outputs, plot("‖e‖", ERROR), plot("log10 ‖x‖", SIZE_LOG10)
+    )
 
 
 def _texts(layout: LoopLayout) -> rrb.Container:
