@@ -594,7 +594,7 @@ def times_between_events(resolved: Table) -> tuple[int, int]:
     return min(least, times.longest), times.longest
 
 
-_OF_REST = ("reference", "safe_input", "update_timeout_s", "timeout_input")
+_OF_REST = ("reference", "setpoint", "safe_input", "update_timeout_s", "timeout_input")
 """Settings of the controller that do not change by what the difference of two runs is multiplied."""
 
 

@@ -249,7 +249,7 @@ def margin_document(margin: MarginResult) -> Document:
     if not margin.is_periodic:
         note += " In brackets: the time to the next update."
     if margin.certificate is not None and not margin.certificate.is_certified:
-        note += " A loop without a certificate may be stable."
+        note += " A loop without a certificate may be stable; a search, noack certify, may find one."
     return Document(
         title=margin.scenario,
         data=margin.to_json(),

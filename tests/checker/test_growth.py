@@ -42,6 +42,17 @@ def periodic(name: str, *settings: str) -> PeriodicLoop:
     return read_periodic_loop(resolved_content(resolved))
 
 
+def test_a_set_point_does_not_change_the_growth() -> None:
+    """Of any form: as a scenario states it, and as a resolved one has it."""
+    resolved = scenario("lane_periodic", "controller.setpoint=[0.0, 0.0, 0.0, 3.5]")
+    at_rest = matrices(periodic("lane_periodic"))
+    for content in (resolved.content(), resolved_content(resolved)):
+        np.testing.assert_array_equal(matrices(read_periodic_loop(content)), at_rest)
+    words = ("margin", "lane_periodic", "--no-period", "--most", "2")
+    moved = invoke(*words, "--set", "controller.setpoint=[0, 0, 0, 3.5]")
+    assert moved.stdout == invoke(*words).stdout
+
+
 def matrices(loop: PeriodicLoop) -> tuple[list[Matrix], list[Matrix]]:
     """The matrices of a unit with and without an arrival, by slot, from the scenario's times alone."""
     A, B, K, H = map(floats, loop.matrices)
