@@ -102,7 +102,7 @@ def conclude(
         bounds.append(sensor_error(loop, rate, proven["drift"]))
     sensor = bounds[-1] if "drift" in proven else proven.get("e_s")
     gains = Gains(loop, rate, read_table(document, "gains")) if "gains" in document else None
-    by_gains = None if gains is None else _apart_by_gains(gains, read_table(document, "gains"))
+    by_gains = None if gains is None else _apart_by_gains(loop, gains, read_table(document, "gains"))
     if of_forms:
         is_quiet = require_few_at_start(loop, assumed)
         require_few_later(loop, assumed, apart if is_quiet else None)
@@ -145,19 +145,19 @@ def _about(loop: Loop, bound: Bound) -> Bound:
     return bound._replace(constant=bound.constant + loop.offset * spectral_norm(row))
 
 
-def _apart_by_gains(gains: Gains, table: Mapping[str, object]) -> arb | None:
+def _apart_by_gains(loop: Loop, gains: Gains, table: Mapping[str, object]) -> arb | None:
     """Return a least time between any two events, as proven; None: the document states none.
 
     With v = e^{−rt}, ‖W (e_s − n)‖ reaches at most a v + b, and the threshold is max(c v, f): see
-    :func:`_prove_inter_event`.
+    :func:`_prove_inter_event`. The rule is that of the loop: one for which it is taken has other events.
     """
     if "inter_event_s" not in table:
         return None
     apart = read_number(table, "inter_event_s")
-    _require_silent(gains.loop, apart)
+    _require_silent(loop, apart)
     decaying, constant = gains.reached(apart)
     if apart > 0:
-        _require_below(gains.loop, gains.rate, lambda v: decaying * v + constant, is_decaying=constant == 0)
+        _require_below(loop, gains.rate, lambda v: decaying * v + constant, is_decaying=constant == 0)
     return apart
 
 

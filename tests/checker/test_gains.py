@@ -353,6 +353,20 @@ def test_a_rule_that_integrates_has_nothing_but_a_floor() -> None:
             prove(loop, document)
 
 
+def test_an_error_below_the_mean_threshold_may_still_fill_the_area() -> None:
+    """|e_s| grows by 30/s and is below a/T = 1 for 20 ms, but its integral is above a = 0.001 after 9 ms."""
+    loop = changed(AREA, sampling=fmpq(1, 1000), least_sampling=fmpq(1, 1000), start=fmpq(0))
+    loop = loop._replace(
+        start=zeros(1, 1), sizes=(number(30.0),), rule=AREA.rule._replace(floor=number(0.001))
+    )
+    document = copy.deepcopy(by_gains(loop)[0])
+    document["gains"] |= {"tests": 1}
+    prove(loop, document)
+    document["gains"] |= {"inter_event_s": 0.02}
+    with pytest.raises(RejectedError, match="not proven for this rule"):
+        prove(loop, document)
+
+
 def test_no_forms_are_those_of_a_rule_that_integrates() -> None:
     loop = double_integrator(SCHEDULE)
     document = find_witness(loop, ("x",)).document
