@@ -125,11 +125,12 @@ void noack_observe(
     const double *inputs = message->vector + observer->p;
     for (int64_t before = steps; before > 0; before--)
         noack_observer_predict(observer, inputs + m * max_of(known - before, 0));
-    if (observer->t_ns < 0 && observer->first_gain != NULL)
+    if (!observer->is_corrected && observer->first_gain != NULL)
         correct_estimate(observer, observer->first_gain, message->vector);
     else
         noack_observer_correct(observer, message->vector);
     observer->t_ns = t_ns;
+    observer->is_corrected = 1;
 }
 
 /* How it is made. ------------------------------------------------------------------------------ */

@@ -223,16 +223,17 @@ void noack_plant_free(noack_plant *plant);
 
 /* The observer of a sensor. Luenberger: the gain is given. Kalman: it follows from P. */
 typedef struct {
-    int64_t kind;     /* enum noack_observer_kind */
+    int64_t kind;         /* enum noack_observer_kind */
     int64_t n, m, p;
-    int64_t reported; /* entries of a measurement that are inputs applied, behind y */
+    int64_t reported;     /* entries of a measurement that are inputs applied, behind y */
     double *Ad, *Bd, *C;
-    double *Q, *R;   /* (n, n), (p, p) */
-    double *gain;    /* (n, p); of a Kalman filter not to be given */
-    double *first_gain; /* (n, p) at the first measurement, of an estimate without a time; NULL: gain */
-    double *x, *P;   /* the state: (n,), (n, n) */
-    int64_t t_ns;    /* time of the estimate; -1: that of the first measurement */
-    double *scratch; /* (3 n n + n p + p p + 2n + p,) */
+    double *Q, *R;        /* (n, n), (p, p) */
+    double *gain;         /* (n, p); of a Kalman filter not to be given */
+    double *first_gain;   /* (n, p) at the first measurement; NULL: gain */
+    double *x, *P;        /* the state: (n,), (n, n) */
+    int64_t t_ns;         /* time of the estimate; -1: that of the first measurement */
+    int64_t is_corrected; /* whether there was a measurement */
+    double *scratch;      /* (3 n n + n p + p p + 2n + p,) */
 } noack_observer;
 
 noack_observer *noack_observer_new(const noack_observer *settings, const char **wrong);

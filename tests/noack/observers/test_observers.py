@@ -10,6 +10,7 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 from scipy.stats import chi2
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
+from cosim.analysis.explained_run.explain import explains
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.align import align_tables, true_states
@@ -103,6 +104,21 @@ def test_measurements_that_are_lost_are_bridged_and_replayed(observed: dict[str,
     moved = np.abs(np.diff(record[PLANT_STEP]["u"][:, 0])).max() * 4 * 0.04
     assert error[60:].max() < moved
     assert error[20:30].max() < 1e-6
+
+
+@pytest.mark.parametrize("initial_sync", ["known_state", "first_packet"])
+def test_the_first_measurement_has_its_own_gain_whatever_is_known(
+    observed: dict[str, Any], initial_sync: str
+) -> None:
+    observed["observer"] = {
+        "kind": "luenberger", "gain": [[0.5], [0.5]], "first_gain": [[1.0], [0.0]],
+        "initial_estimate": [0.3, -0.2],
+    }  # fmt: skip
+    observed["network"] |= {"initial_sync": initial_sync}
+    record = run(observed)
+    rows = record["sensor_measurement"]
+    np.testing.assert_allclose(rows["x"][0], [rows["y"][0, 0], -0.2], rtol=1e-12)
+    assert not explains(record)
 
 
 def test_i1_is_claimed_of_the_estimate(
