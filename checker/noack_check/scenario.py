@@ -286,7 +286,7 @@ def _start(resolved: Table, plants: _Plants) -> _Start:
     k = _whole(model, "model.load_states") if "load_states" in model else 0
     if not k:
         return {"start": x_0}
-    _require_unknown_start(resolved, "model.load_states")  # loads are not known
+    _require_unknown_start(resolved, "loads")  # they are not known
     n = len(plants.A) - k
     if n < 1:
         raise RefusedError("model.load_states: not fewer than states")
@@ -772,7 +772,7 @@ def _noise(resolved: Table, n: int) -> arb_mat:
     if len(sizes) != p or min(sizes) < 0:
         raise RefusedError(f"{name}: not {p} numbers of at least 0")
     if any(sizes):
-        _require_unknown_start(resolved, name)
+        _require_unknown_start(resolved, "noise")
     bounds = matrix([[size * (i == k) for k in range(p)] for i, size in enumerate(sizes)])
     return columns_of(through * bounds, [i for i, size in enumerate(sizes) if size > 0])
 
@@ -792,7 +792,7 @@ def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | No
     """Return the observer in the sensor, if there is one, of a plant that its matrices describe exactly."""
     if "observer" not in resolved:
         return None
-    _require_unknown_start(resolved, "observer")
+    _require_unknown_start(resolved, "an observer")
     model, plant, observer = (_table(resolved, key) for key in ("model", "plant", "observer"))
     for key, rows, half in (("A", plants.A, plants.half_A), ("B", plants.B, plants.half_B)):
         if rows != model[key] or any(map(any, half)):
@@ -817,10 +817,10 @@ def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | No
     return Observer(correction, first_correction, start, fmpq(int(schedule.sample), NS_PER_S))
 
 
-def _require_unknown_start(resolved: Table, name: str) -> None:
+def _require_unknown_start(resolved: Table, what: str) -> None:
     """Require that the first update is sent at t = 0: before it x is not known to sensor and controller."""
     if _value(_table(resolved, "network"), "network.initial_sync") == "known_state":
-        raise RefusedError(f'{name}: with network.initial_sync = "known_state" not covered')
+        raise RefusedError(f'network.initial_sync = "known_state": not covered with {what}')
 
 
 def _product(M: arb_mat, v: Sequence[float]) -> list[arb]:

@@ -93,6 +93,7 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
     claims = [claim for claim in loop.claims if claim.until_s is None]  # they hold to the end of the run
     held = [claim for claim in claims if claim.output and claim.verdict == "held"]
     guaranteed = {claim.output: claim.what for claim in held if " stays within " in claim.what}
+    bounded = {claim.output for claim in held}
     texts, is_good, is_late = [], not _grew(loop), loop.certified_for is not None
     for output in loop.outputs:
         if output.allowed is None:
@@ -105,7 +106,8 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
             texts.append(f"{output.name} was within {allowed} of its {output.target} {since}")
         what = guaranteed.get(output.name, "")
         promised = what.rpartition(" from ")[2] if f" of its {output.target} " in what else ""
-        lacking = "not guaranteed for delays as in this run" if is_late else "not guaranteed"
+        by = " by the end of the run" if output.name in bounded else ""  # later, or not at all
+        lacking = "not guaranteed for delays as in this run" if is_late else f"not guaranteed{by}"
         texts[-1] += f" (guaranteed from {promised})" if promised else f" ({lacking})"
         is_good = is_good and output.settled_s is not None
     together = " and "

@@ -28,8 +28,6 @@ def test_a_key_of_a_rule_within_a_rule_is_that_of_a_trigger() -> None:
 
 REFUSED = {
     'observer={kind="kalman", process_std=[1, 1], noise_std=[1, 1], initial_std=[1, 1]}': "observer.kind",
-    "plant.measurement.noise_std=[0.1, 0.0]": "plant.measurement.noise_std",
-    'plant.disturbances=[{kind="gaussian", std=[0.1]}]': "plant.disturbances.kind",
     "controller.safe_input=[1.0]": "controller.safe_input",
     "controller.update_timeout_s=1.0": "controller.update_timeout_s",
     "network.protocol=ack": "network.protocol",

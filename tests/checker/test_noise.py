@@ -250,7 +250,7 @@ def test_noise_is_refused_if_the_start_is_known() -> None:
     tables = resolved_tables(
         "double_integrator", "plant.measurement.noise_bound=[0.01, 0.0]", "network.initial_sync=known_state"
     )
-    with pytest.raises(RefusedError, match="known_state"):
+    with pytest.raises(RefusedError, match='known_state": not covered with noise'):
         read_loop(tables, box=False, ideal=False)
 
 

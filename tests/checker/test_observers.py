@@ -259,7 +259,6 @@ REFUSED = {
     "plant.B=[[0.0], [0.9]]": r"plant\.B",
     "network.initial_sync=known_state": "known_state",
     "plant.rate_hz=300": "observer: not covered",
-    "plant.measurement.noise_std=[0.1]": r"plant\.measurement\.noise_std",
     'observer={kind="kalman", process_std=[1, 1], noise_std=[1], initial_std=[1, 1]}': r"observer\.kind",
 }
 

@@ -45,6 +45,22 @@ def test_a_line_states_whether_the_guarantee_was_kept(outcome: Outcome) -> None:
 
 
 @pytest.mark.parametrize(
+    ("settings", "lacking"),
+    [
+        ((), "not guaranteed by the end of the run"),
+        (("controller.update_timeout_s=1.0",), "not guaranteed"),
+    ],
+)
+def test_a_run_that_ends_before_its_guarantee_begins_says_so(
+    settings: tuple[str, ...], lacking: str, tmp_path: Path
+) -> None:
+    """The bound of the position is within the allowed error from 11.1 s on."""
+    ending = simulate_run(shipped("double_integrator", "horizon_s=3.0", *settings), tmp_path)
+    line = verdict(finalize(ending, report=False, view=False).summary)[0]
+    assert f" ({lacking})" in line.text
+
+
+@pytest.mark.parametrize(
     ("first", "largest", "final", "diverged_at_s", "text"),
     [
         (2.0, 2.0, 0.1999, None, "stable, ‖x‖ fell from 2 to 0.2"),
