@@ -24,7 +24,7 @@ def certificate_of(
     """Return the certificate of a resolved scenario with what is proven under some conditions."""
     probability, bounds = None, statement.bounds
     if bounds is not None and not resolved.network.enforce_mansd:
-        probability = kept_probability(resolved, conditions.guarantee, bounds.inter_event_s)
+        probability = kept_probability(resolved, conditions, bounds)
     assumed = tuple(certificate_assumptions(resolved, conditions, probability))
     void = None if bounds is not None else statement.reason
     return ScenarioCertificate(_SCOPES[statement.plants], conditions, assumed, bounds, void)

@@ -23,6 +23,7 @@ from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows, Table
 from noack.theory.certificates.normal_values import normal_limit, with_bounded_values
+from noack.theory.certificates.proven_bounds import ProvenBounds
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
@@ -206,25 +207,20 @@ def ideal_conditions(resolved: Scenario) -> NetworkConditions:
     return NetworkConditions(dropouts=guarantee.longest_burst, constraints=tuple(further))
 
 
-def most_events(resolved: Scenario, inter_event_s: float) -> int:
-    """Return the largest number of events in a run, given a bound of its inter-event times."""
-    return math.floor(resolved.timing.horizon_ns / NS_PER_S / inter_event_s * (1 + 1e-12)) + 1
-
-
-def kept_probability(
-    resolved: Scenario, guarantee: LossGuarantee, inter_event_s: float | None
-) -> float | None:
+def kept_probability(resolved: Scenario, conditions: NetworkConditions, bounds: ProvenBounds) -> float | None:
     """Bound the probability that a run's losses keep a guarantee that nothing enforces.
 
-    Until the first loss too many, events are at least ``inter_event_s`` apart, but for runs whose normal
-    values exceed their bounds. None: there is no such bound, or the losses are no Markov chain over the
-    packets.
+    Until the first loss too many, events are as far apart as proven, but for runs whose normal values
+    exceed their bounds. None: there is no such bound, or none up to the end of the run, or the losses are
+    no Markov chain over the packets.
     """
-    if not inter_event_s:
+    tests_s = conditions.spacing_s or conditions.apart_s
+    packets = bounds.most_events(resolved.timing.horizon_ns / NS_PER_S, conditions.start_s, tests_s)
+    if packets is None or jump_s(resolved) is not None:
         return None
     try:
         losses = loss_process(resolved.network.link)
-        kept = losses.keeps(guarantee, most_events(resolved, inter_event_s))
+        kept = losses.keeps(conditions.guarantee, packets)
     except NotPredictableError:
         return None
     excluded = 0.0 if normal_limit(resolved) is None else resolved.certificate.exceedance_probability

@@ -96,6 +96,22 @@ class ProvenBounds(NamedTuple):
             return np.where(events_s >= started_s, apart_s, 0.0)
         return np.where(events_s > 0, apart_s, min(self.first_event_s or 0.0, apart_s))
 
+    def most_events(self, until_s: float, started_s: float, tests_s: float) -> int | None:
+        """Return the largest number of events up to a time; None: it is not known.
+
+        Args:
+            until_s: the time.
+            started_s: when the first input acts at the latest.
+            tests_s: the shortest time between two tests; 0: there is none.
+        """
+        apart_s, most = self.inter_event_s or 0.0, 1 + 1e-12
+        if not apart_s or not (self.is_quiet or tests_s):
+            return None
+        found = math.floor(until_s / apart_s * most) + 1
+        if not self.is_quiet:  # before the first input each test may be an event
+            return found + math.floor(started_s / tests_s * most) + 1
+        return found + ((self.first_event_s or 0.0) < apart_s)
+
     @property
     def exception(self) -> str:
         """Between which events the inter-event time is not proven, in words; empty: between all."""

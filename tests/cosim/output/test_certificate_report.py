@@ -12,13 +12,14 @@ from rich.console import Console
 
 from cosim.analysis.certificates import Certificates, certificates_of
 from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.analysis.scenario_certificates import certificate_of
+from cosim.analysis.scenario_certificates import certificate_of, quick_certificate
 from cosim.analysis.witnesses import WitnessedStatement, find_statement
 from cosim.output.certificate_report import certificate_document, certificate_table
 from cosim.output.document import Sentence
 from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate
-from noack.theory.certificates.conditions import allowed_conditions, most_events, outside_box
+from noack.core.linear_systems import Vector
+from noack.theory.certificates.conditions import allowed_conditions, outside_box
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
 from noack_check.sentences import smallest_bounds
 from tests.helpers.approved import compare_text
@@ -178,8 +179,13 @@ def test_a_run_of_the_largest_number_of_events_keeps_the_assumption_as_often_as_
 ) -> None:
     """By 4000 sequences of losses that are drawn here."""
     scheduled = without_a_cap.schedule
-    assert scheduled.inter_event_s is not None
-    packets = most_events(resolved("lane_weighted"), scheduled.inter_event_s)
+    assert scheduled.proven is not None
+    packets = scheduled.proven.most_events(
+        resolved("lane_weighted").timing.horizon_ns / 1e9,
+        scheduled.conditions.start_s,
+        scheduled.conditions.spacing_s,
+    )
+    assert packets is not None
     lost = np.random.default_rng(1).uniform(size=(4000, packets)) < P
     lost[:, 0] = False
     bursts = np.lib.stride_tricks.sliding_window_view(lost, MANSD + 1, axis=1)
@@ -285,3 +291,35 @@ def test_bounds_of_the_command_are_those_of_the_checker() -> None:
         (bound,) = (b for b in smallest_bounds(proof) if b.output == "x" and b.from_start)
         assert arb(value) >= bound.decaying
         assert value == pytest.approx(float(bound.decaying.mid()), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("is_quiet", "first_s", "events_s"),
+    [
+        (True, 0.25, np.arange(0, 9, 0.25)),
+        (True, 0.125, np.concatenate([[0.0], np.arange(0.125, 9, 0.25)])),
+        (True, None, np.concatenate([[0.0], np.arange(1e-9, 9, 0.25)])),
+        (False, None, np.concatenate([np.arange(0, 0.5, 0.0625), np.arange(0.5, 9, 0.25)])),
+    ],
+    ids=["all far apart", "an early second one", "a second one at once", "tests before the first input"],
+)
+@pytest.mark.parametrize("until_s", [0.5, 3.0, 8.1])
+def test_no_more_events_are_counted_on_than_may_happen(
+    is_quiet: bool, first_s: float | None, events_s: Vector, until_s: float
+) -> None:
+    bounds = PROVEN._replace(is_quiet=is_quiet, inter_event_s=0.25, first_event_s=first_s)
+    most = bounds.most_events(until_s, 0.5, 0.0625)
+    assert most is not None
+    assert int((events_s <= until_s).sum()) <= most <= int((events_s <= until_s).sum()) + 3
+    assert PROVEN._replace(is_quiet=is_quiet, inter_event_s=None).most_events(until_s, 0.5, 0.0625) is None
+
+
+def test_what_keeps_a_guarantee_is_not_known_beyond_a_jump_of_the_reference() -> None:
+    """After it nothing keeps events apart."""
+    step = 'controller.reference=[{kind="step", output="angle", value=1.0, from_s=8.0}]'
+    free = ("network.enforce_mansd=false", 'network.loss={model="bernoulli", probability=0.01}')
+    for jumps in (True, False):
+        scenario = resolved("servo_reference", *free, step, f"horizon_s={12.0 if jumps else 6.0}")
+        certificate = quick_certificate(scenario)
+        assert certificate.inter_event_s
+        assert any("keeps it with" in each.why for each in certificate.assumptions) != jumps
