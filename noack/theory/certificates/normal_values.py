@@ -1,7 +1,8 @@
 """Bounds of normally distributed values, which have none: a run exceeds these with a small probability.
 
-A run draws finitely many values. Each exceeds its bound with ``certificate.exceedance_probability``, divided
-by their number; so one of them does with at most this probability.
+A run of a loop draws finitely many values. Each exceeds its bound with
+``certificate.exceedance_probability``, divided by their number; so one of them does with at most this
+probability. It is that of each loop of a run.
 """
 
 import math
