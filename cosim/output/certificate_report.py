@@ -143,7 +143,8 @@ def _listed(what: str, tried: Sequence[TriedSettings]) -> str:
     """Return settings that were tried as one text; empty if there are none."""
     if not tried:
         return ""
-    return f"{what} with {', or with '.join(settings.text for settings in tried)}; each was tried alone"
+    alone = "; each was tried alone" if len(tried) > 1 else ""
+    return f"{what} with {', or with '.join(settings.text for settings in tried)}{alone}"
 
 
 def _in_words(results: Certificates) -> Iterator[str]:

@@ -109,6 +109,8 @@ _LONGEST_RUN_S = 20.0
 """Wall time of a live run; a longer horizon runs faster."""
 _SHORTEST_HORIZON_S = 4.6
 """A shorter run would show little."""
+_HORIZON_FACTOR = 1.2
+"""A run lasts at least this times as long as until its outputs are guaranteed to stay where they may be."""
 _MOST_STEPS_PER_TIME_CONSTANT = 1e6
 """Of a slower loop, each simulation would take minutes or more."""
 _LONGEST_HORIZON_S, _HIGHEST_SPEED = 1e7, 1000.0
@@ -179,6 +181,8 @@ class _Trial:
     """Whether friction keeps the plant from x = 0: then a search takes the longest."""
     floor: float | None = None
     """Last threshold; None: a share of the first one."""
+    guaranteed_from_s: float = 0.0
+    """When all outputs are guaranteed to stay within their allowed errors."""
 
 
 def new(
@@ -417,7 +421,11 @@ class _TrialScenarios:
         model, reference = self._model, self._model.plant
         start = trial.x0 if trial.weight is None else trial.weight @ trial.x0
         beta, alpha = to_digits(BETA_SHARE * norm(start) or BETA_SHARE), trial.alpha_per_s
-        horizon_s = max(math.log(1 / HORIZON_DECAY) / alpha, _SHORTEST_HORIZON_S)
+        decayed_s, guaranteed_s = (
+            math.log(1 / HORIZON_DECAY) / alpha,
+            _HORIZON_FACTOR * trial.guaranteed_from_s,
+        )
+        horizon_s = max(decayed_s, guaranteed_s, _SHORTEST_HORIZON_S)
         horizon_s = min(to_digits(horizon_s), _LONGEST_HORIZON_S)
         weight = None
         if trial.weight is not None:
@@ -508,6 +516,9 @@ class _TrialScenarios:
             if wanted == used.floor:
                 break
             trial = replace(trial, floor=wanted)
+        if results.guaranteed is not None:
+            times_s = [bound.settles_s or 0.0 for bound in results.output_bounds(results.guaranteed)]
+            trial = replace(trial, guaranteed_from_s=max(times_s, default=0.0))
         return trial, results
 
     def _with_proof(self, trial: _Trial, report: Callable[[str], None]) -> tuple[_Trial, Certificates]:
@@ -686,7 +697,7 @@ _COMMENTS = {
 }
 """Comments of the file, by table and key."""
 _REASONS = {
-    "horizon_s": " Until its end e^(−alpha_per_s t) falls to a hundredth.",
+    "horizon_s": " Until its end e^(−alpha_per_s t) falls to a hundredth, and what is guaranteed has begun.",
     "trigger.beta": " It is a tenth of the norm of x(0).",
 }
 """How values are chosen that are not given."""

@@ -259,10 +259,10 @@ def certificate_assumptions(
         assumed, source = "disturbances and noise stay within their bounds", "certificate"
         status, why = AssumptionStatus.HOLDS, "by their settings"
         if (limit := normal_limit(resolved)) is not None:
-            status = AssumptionStatus.ASSUMED
-            why = (
-                f"normal values have no bound; {limit:.3g} standard deviations are assumed, and a run "
-                f"exceeds one with a probability of at most {resolved.certificate.exceedance_probability:g}"
+            status, why = AssumptionStatus.ASSUMED, "normal values have no bound"
+            assumed = (
+                f"normal values stay within {limit:.3g} standard deviations; a run exceeds them with a "
+                f"probability of at most {resolved.certificate.exceedance_probability:g}"
             )
         checked.append(Assumption(assumed, source, status, why))
     return checked

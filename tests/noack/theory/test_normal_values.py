@@ -48,8 +48,8 @@ def test_a_normal_disturbance_without_size_is_none() -> None:
 def test_runs_with_normal_values_keep_their_bounds_and_the_assumption_is_named() -> None:
     certificate = quick_certificate(resolved("double_integrator", *NORMAL))
     assert certificate.exists, certificate.void
-    (why,) = (each.why for each in certificate.assumptions if "bounds" in each.what)
-    assert "probability of at most 1e-06" in why
+    (what,) = (each.what for each in certificate.assumptions if "normal values" in each.what)
+    assert "probability of at most 1e-06" in what
     for seed in range(3):
         record = simulate(
             resolved("double_integrator", *NORMAL, f"seeds.disturbance={seed}", f"seeds.noise={seed}")

@@ -125,6 +125,17 @@ def test_each_plant_of_noack_gets_a_scenario(name: str) -> None:
     assert noack.simulate(noack.load("made.toml", {"horizon_s": 0.5})).ok
 
 
+def test_a_run_lasts_until_its_guarantee_has_begun() -> None:
+    made = noack.new(noack.gain("unstable_pendulum"), "made.toml", allowed={"angle": 0.003})
+    begins = re.search(r"from ([\d.]+) s on", made.guarantee)
+    assert begins is not None
+    assert float(begins[1]) < made.scenario.horizon_s
+    given = noack.new(
+        noack.gain("unstable_pendulum"), "given.toml", allowed={"angle": 0.003}, settings={"horizon_s": 0.5}
+    )
+    assert given.scenario.horizon_s == 0.5
+
+
 SERVO = """
 class Servo:
     states = ["angle, rad", "rate, rad/s"]
