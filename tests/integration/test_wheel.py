@@ -164,7 +164,7 @@ def test_the_installed_wheel_runs_without_the_repository(noack: Installed) -> No
     assert run["exit"]["status"] == 0
     assert run["loops"][0]["replay"]["bit_exact"]
     report = (noack.folder / "runs" / "latest" / "report.html").read_text(encoding="utf-8")
-    assert report.count("<figure") == 8
+    assert report.count("<figure") == 9
     assert "completed 0.5 s" in report
     view = noack("view")
     assert (view.returncode, view.stderr.count("\n")) == (2, 1)
