@@ -48,13 +48,17 @@ def explains(record: RunRecord, conditions: NetworkConditions | None = None) -> 
 
 
 def states_schedule(resolved: Scenario) -> bool:
-    """Whether the times of a loop's updates and inputs have bounds that do not depend on the machine."""
+    """Whether the times of a loop's updates and inputs have bounds that do not depend on the machine.
+
+    A watchdog may replace inputs where actuations may be lost.
+    """
     network = resolved.network
     directions = [network.link] + ([] if network.actuation is None else [network.actuation.link])
     stated_s = resolved.certificate.network_delay_s
     return (
         is_papers_loop(resolved)
         and network.enforce_mansd
+        and (network.actuation is None or resolved.plant.watchdog.policy == "hold")
         and all(link.delay_is_bounded for link in directions)
         and (stated_s is None or stated_s >= network.link.longest_delay_s)
     )

@@ -213,3 +213,14 @@ def test_runs_of_shipped_scenarios_are_explained(name: str) -> None:
     for record in [*run.loops][:4]:
         findings = explains(record)
         assert not findings, "\n".join(map(str, findings[:5]))
+
+
+def test_a_watchdog_may_replace_inputs_where_actuations_may_be_lost() -> None:
+    """Its timeout is shorter than three lost actuations take: no finding, and no bound."""
+    lost = 'network.actuation={mansd=4,loss={model="bernoulli",probability=0.5}}'
+    watchdog = 'plant.watchdog={policy="zero",timeout_s=0.003}'
+    scenario = shipped("double_integrator", lost, watchdog, "horizon_s=2.0")
+    record = simulate_loops(resolve_run(scenario)).record(0)
+    replaced = (record["plant_step"]["u"] == 0).all(axis=1)
+    assert replaced[10:].any()
+    assert not explains(record)
