@@ -1,9 +1,8 @@
-"""Methods and functions whose results are kept; their arguments may be arrays."""
+"""Methods whose results are kept; their arguments may be arrays."""
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
-from functools import lru_cache, wraps
-from typing import Concatenate, Generic, ParamSpec, TypeVar
+from functools import wraps
+from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -35,41 +34,6 @@ def cached_method(
 
 def _bits(*args: object, **kwargs: object) -> Hashable:
     return *map(_key, args), *((name, _key(value)) for name, value in kwargs.items())
-
-
-def cached_function(
-    most: int, key: Callable[..., Hashable] = _bits
-) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Keep the latest ``most`` results of a function.
-
-    Neither the arguments nor the results may be changed. Both are kept.
-
-    Args:
-        most: number of results.
-        key: of arguments; those with equal keys have equal results. By default it consists of the
-            arguments, which are hashable or arrays.
-    """
-
-    def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-        @lru_cache(most)
-        def result_of(call: _Call[Result]) -> Result:
-            return call.compute()
-
-        @wraps(function)
-        def wrapper(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            return result_of(_Call(key(*args, **kwargs), lambda: function(*args, **kwargs)))
-
-        return wrapper
-
-    return cached
-
-
-@dataclass(frozen=True)
-class _Call(Generic[Result]):
-    """A call of a function, which equals others with the same arguments."""
-
-    key: Hashable
-    compute: Callable[[], Result] = field(compare=False)
 
 
 def _key(argument: object) -> object:

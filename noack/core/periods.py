@@ -119,8 +119,5 @@ def period_of(rate_hz: float) -> Period:
     return Period(exact.limit_denominator(min(MOST_PARTS, int(exact))))
 
 
-NO_PERIOD = (0, 0, 1)
-"""The core's ``noack_period`` of a machine without ticks."""
-
 ANY_PERIOD = Period(1)
 """The period of the inputs of a plant that predicts none."""

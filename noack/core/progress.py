@@ -12,8 +12,3 @@ class Progress(Protocol):
 
 def no_progress(_done: float, _total: float = 1.0, /) -> None:
     """Report nothing."""
-
-
-def part_of(progress: Progress, number: int, parts: int) -> Progress:
-    """Return what reports the progress of one of several equal parts, which have numbers from 0."""
-    return lambda done, total=1.0, /: progress(number + done / total, parts)
