@@ -118,6 +118,14 @@ def witnesses_are_found_once(tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 @pytest.fixture
+def nothing_was_found_before(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hide what searches of other tests found: an answer without a search is better where it is stored."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+
+
+@pytest.fixture
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Finalise runs without a report, whose figures take longer than everything else."""
     monkeypatch.setattr("cosim.live.finalize._write_report", lambda *_: None)

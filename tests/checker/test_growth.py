@@ -24,6 +24,8 @@ from noack_check.keys import RefusedError
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import shipped
 
+pytestmark = pytest.mark.usefixtures("nothing_was_found_before")
+
 PERIODIC = "trigger={policy='periodic', period_s=0.1}"
 LONGEST = 9
 """Of the patterns that are played."""

@@ -10,6 +10,8 @@ from cosim.cli.played_pattern import GROWN, until_it_shows
 from cosim.output.result_tables import Tone
 from tests.helpers.command_line import invoke
 
+pytestmark = pytest.mark.usefixtures("nothing_was_found_before")
+
 
 def guarantee_line(scenario: str, **settings: object) -> str:
     line = noack.simulate(noack.load(scenario, {"horizon_s": 1.0, **settings})).verdict[-2]

@@ -11,6 +11,8 @@ from cosim.output.requirements import unmet_by_run
 from tests.helpers.command_line import invoke
 from tests.helpers.summaries import claim, with_values
 
+pytestmark = pytest.mark.usefixtures("nothing_was_found_before")
+
 ALL = ("--require", "certificate", "--require", "guarantee", "--require", "stable")
 UNENFORCED = ("--set", "network.enforce_mansd=false")
 

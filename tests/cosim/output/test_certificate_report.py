@@ -26,6 +26,8 @@ from tests.helpers.approved import compare_text
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import resolved, shipped
 
+pytestmark = pytest.mark.usefixtures("nothing_was_found_before")
+
 LATE = 'network.impairments=[{kind="delay", delay_s=1.0}]'
 QUEUE = 'network.impairments=[{kind="rate",rate_bps=400000,queue=100}]'
 

@@ -12,6 +12,8 @@ from tests.cosim.output.parsed_page import Page
 from tests.helpers.approved import compare_output
 from tests.helpers.command_line import invoke
 
+pytestmark = pytest.mark.usefixtures("nothing_was_found_before")
+
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> noack.Run:
