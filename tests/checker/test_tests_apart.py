@@ -71,11 +71,6 @@ def base(name: str) -> tuple[Loop, Witness]:
     return loop, find_witness(loop, ("x", "e_c"))
 
 
-def bound_of(witness: Witness, output: str = "x") -> float:
-    bound = next(bound for bound in witness.proof.bounds if bound.output == output)
-    return float(bound.decaying.mid()) + float(bound.constant.mid())
-
-
 @pytest.mark.parametrize("name", LOOPS)
 def test_runs_stay_below_the_bounds(name: str) -> None:
     loop, witness = base(name)
