@@ -210,34 +210,3 @@ int load_pace(
     }
     return 0;
 }
-
-static void count_arrivals(int sink, struct soak *state) {
-    struct arrival arrivals[BATCH];
-    for (int taken; (taken = take(sink, arrivals)) > 0;)
-        for (int k = 0; k < taken; k++) {
-            int64_t gap = arrivals[k].number - state->next;
-            state->received++;
-            if (gap < 0) {
-                state->disordered++;
-                continue;
-            }
-            state->longest_gap = gap > state->longest_gap ? gap : state->longest_gap;
-            state->next = arrivals[k].number + 1;
-        }
-}
-
-/* Send `groups` groups of `group` datagrams, one group every period_ns, and receive arrivals in
- * between; continues the numbering of `state`. */
-int load_soak(
-    int out, int sink, int64_t groups, int64_t group, int64_t period_ns, struct soak *state) {
-    int64_t begun_ns = now_ns(CLOCK_MONOTONIC);
-    for (int64_t k = 0; k < groups; k++) {
-        sleep_until(begun_ns + (k + 1) * period_ns);
-        int failed = send_all(out, state->sent, group, NULL, 0);
-        if (failed)
-            return failed;
-        state->sent += group;
-        count_arrivals(sink, state);
-    }
-    return 0;
-}

@@ -12,14 +12,3 @@ int load_burst(
 int load_ping(int out, int sink, int64_t first, int64_t count, int64_t *delay_ns);
 int load_pace(
     int out, int sink, int64_t first, int64_t count, int64_t period_ns, int64_t *delay_ns);
-
-struct soak {
-    int64_t sent;
-    int64_t received;
-    int64_t next;        /* the number that would arrive next without a loss */
-    int64_t longest_gap; /* maximum number of consecutive losses */
-    int64_t disordered;  /* arrivals after a higher number; 0 through a FIFO */
-};
-
-int load_soak(
-    int out, int sink, int64_t groups, int64_t group, int64_t period_ns, struct soak *state);

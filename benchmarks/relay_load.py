@@ -4,9 +4,7 @@ The load is ``load.c``: this process is sender and sink of every relay. Arrival 
 kernel's timestamps, so that they do not depend on the time at which the sink is read.
 """
 
-import json
 import os
-import signal
 import socket
 import struct
 import subprocess
@@ -34,8 +32,6 @@ _PROBE_DATAGRAMS = 20_000
 """Datagrams of a first burst, by which the capacity of a relay's buffer is measured."""
 _LOSSY_SLACK = 16
 """With 5 % loss, this number of consecutive losses does not occur within a benchmark."""
-_END_S = 30.0
-"""Maximum wait for a relay to end."""
 _SO_RCVBUFFORCE, _SO_TIMESTAMPNS = 33, 35
 _SINK_BUFFER_BYTES = 64 * 1024 * 1024
 _PING_TIMEOUT_S = 0.2
@@ -75,8 +71,6 @@ class PathEnds:
             option(socket.SO_RCVBUF, _SINK_BUFFER_BYTES)
         option(_SO_TIMESTAMPNS, 1)
         option(socket.SO_RCVTIMEO, struct.pack("@ll", 0, round(_PING_TIMEOUT_S * 1e6)))
-        self.soaked = _FFI.new("struct soak *")
-        """Counts of the steady load."""
 
     def close(self) -> None:
         """Close both sockets."""
@@ -108,10 +102,6 @@ class PathEnds:
         function, period = ("pace", (period_ns,)) if period_ns else ("ping", ())
         self._call(function, self._first(count), count, *period, _FFI.from_buffer("int64_t[]", delays_ns))
         return delays_ns
-
-    def soak(self, groups: int, group: int, period_ns: int) -> None:
-        """Send ``groups`` groups of ``group`` datagrams, one group every ``period_ns``."""
-        self._call("soak", groups, group, period_ns, self.soaked)
 
     def _first(self, count: int) -> int:
         first, self._sent_count = self._sent_count, self._sent_count + count
@@ -149,7 +139,7 @@ def c_relay(*words: str) -> RelayKind:
 def our_relay(name: str, words: str, *, lossy: bool = True) -> RelayKind:
     """Return ``python -m netem`` with impairments in tc's words and further options."""
     ends = ("--listen", LOOPBACK + ":{port}", "--to", LOOPBACK + ":{to}")
-    return RelayKind(name, (sys.executable, "-m", "netem", *ends, *words.split(), "--json"), lossy)
+    return RelayKind(name, (sys.executable, "-m", "netem", *ends, *words.split()), lossy)
 
 
 @dataclass
@@ -187,14 +177,6 @@ class LoadedRelay:
         if decisions <= 0 or decisions < sent - slack or (slack == 0 and result.received != sent):
             raise MeasurementError(f"of a burst of {sent} only {result.received} arrived")
         return {"per_s": decisions / result.wall_ns * 1e9, "cpu_us": cpu_s / sent * 1e6}
-
-    def totals(self) -> dict[str, int]:
-        """End our relay as Ctrl-C does; return its counts of the datagrams towards the sink."""
-        self.process.send_signal(signal.SIGINT)
-        stdout, _ = self.process.communicate(timeout=_END_S)
-        _, _, totals = stdout.partition("\n")  # the first line reports that it is ready
-        (link,) = json.loads(totals)["links"]
-        return {**link["forward"], **link["forward"]["unintended"]}
 
 
 @contextmanager

@@ -183,24 +183,12 @@ def shell_spec(options: argparse.Namespace) -> LinkSpec:
     return LinkSpec(LINK_NAME, _NO_ADDRESS, _NO_ADDRESS, forward, reverse, seed, idle_s=_idle_s(options.idle))
 
 
-_REMOVED = {
-    "--capture": "`tcpdump -i any -w FILE udp` captures",
-    "--record-fates": "the same --seed gives the same losses",
-    "--replay-fates": "the same --seed gives the same losses",
-    "--view": "`noack netem watch` shows the statistics of an emulator with --control NAME",
-}
-"""Options of earlier builds, and the plain way."""
-
-
 def parse_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command line.
 
     Raises:
         CallerError: a word begins with dashes, or --session is combined with other options.
     """
-    for argument in arguments:
-        if (option := argument.partition("=")[0]) in _REMOVED:
-            raise CallerError(f"{option}: was removed; {_REMOVED[option]}")
     require_no_dashes(arguments)
     # With a space before it, argparse takes -1,2 for a word, not for an option.
     words = [f" {argument}" if re.match(r"-[0-9.]", argument) else argument for argument in arguments]

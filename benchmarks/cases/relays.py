@@ -8,19 +8,15 @@ relay, and ratios are the median over rounds of the ratio within a round.
 """
 
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
-from statistics import median
-
-import psutil
 
 from benchmarks import relay_load
 from benchmarks.cases.latency import KERNEL, cyclictest
 from benchmarks.programs import LOAD_CORE, RELAY_CORE, on_core
 from benchmarks.relay_load import SOCAT, LoadedRelay, c_relay, our_relay
-from benchmarks.report import ZERO, Goal, MeasurementError, Peer, Row, announce, benchmark
+from benchmarks.report import Goal, MeasurementError, Row, benchmark
 from benchmarks.rounds import Figures, Rounds, quantiles_us
 
 ROUNDS = 2
@@ -151,57 +147,3 @@ def _late() -> Rounds:
         sides = {KERNEL: kernel} | {name: partial(late, relay) for name, relay in relays.items()}
         rounds.measure_in_turn(LINE_ROUNDS, sides, "lateness, ")
     return rounds
-
-
-MANSD = 4
-MEMORY_GOAL = Goal("<=", 1024)
-"""KiB; a leak of two bytes per datagram shows in ten seconds."""
-_BURSTS = 15
-_GROUP_S = 250e-6
-"""Approximate time between two groups of datagrams."""
-
-
-@benchmark("relay_soak", "Our relay under a steady load")
-def steady_load(soak_s: int = 20) -> Iterator[Row]:
-    """Load our relay with half its maximum rate: no unintended loss, constant memory.
-
-    The relay must receive all sent datagrams, and all forwarded ones must arrive at the sink.
-    ``--set soak_s=600`` is the full test; it must be at least 4.
-    """
-    kind = our_relay(PLAIN, f"loss 5% mansd {MANSD} seed 7 --one-way")
-    with relay_load.running(kind) as relay, on_core(LOAD_CORE):
-        maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
-    with relay_load.running(kind) as relay:
-        yield from _soak_rows(relay, soak_s, maximum_per_s)
-
-
-def _soak_rows(relay: LoadedRelay, seconds: int, maximum_per_s: float) -> Iterator[Row]:
-    """Load a relay with half of its maximum rate, in groups of datagrams; yield the rows."""
-    group = max(round(maximum_per_s / 2 * _GROUP_S), 1)
-    period_ns = round(group / (maximum_per_s / 2) * 1e9)
-    groups_per_s = round(1e9 / period_ns)
-    resident_kib = list[float]()
-    began_s = time.monotonic()
-    with on_core(LOAD_CORE):
-        for number in range(seconds):
-            if number % 60 == 0:
-                announce(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
-            relay.ends.soak(groups_per_s, group, period_ns)
-            resident_kib.append(psutil.Process(relay.process.pid).memory_info().rss / 1024)
-        elapsed_s = time.monotonic() - began_s
-        # Empty groups for 0.1 s: receive the datagrams still in flight.
-        relay.ends.soak(round(0.1 / _GROUP_S), 0, period_ns)
-    counts, totals, quarter = relay.ends.soaked, relay.totals(), max(seconds // 4, 1)
-    growth_kib = median(resident_kib[-quarter:]) - median(resident_kib[quarter : 2 * quarter])
-    peer, note = Peer("drained maximum", maximum_per_s), f"for {elapsed_s:.0f} s"
-    yield Row("load", counts.sent / elapsed_s, "datagrams/s", peer, note=note)
-    for name, number in (
-        ("sent but not counted as arrived", counts.sent - totals["received"]),
-        ("forwarded but not received", totals["forwarded"] - counts.received),
-        ("lost in the relay's receive buffer", totals["lost_in_kernel"]),
-        ("received out of order", counts.disordered),
-    ):
-        yield Row(name, number, "datagrams", goal=ZERO)
-    yield Row("longest loss burst", counts.longest_gap, "datagrams", goal=Goal("<=", MANSD))
-    note = f"of {resident_kib[-1] / 1024:.0f} MiB"
-    yield Row("memory, last quarter beyond second", growth_kib, "KiB", goal=MEMORY_GOAL, note=note)

@@ -17,7 +17,6 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from cosim.cli.options import PANELS, examples
-from cosim.cli.removed_words import removal_in
 from noack.core.errors import CallerError, ExitStatus, NoackError, plain_mistake, printable, why
 from noack.core.extension_points import missing_extension, parts
 from noack.core.system_processes import exhausted_limit
@@ -80,8 +79,7 @@ class Program(TyperGroup):
             line = "; ".join([str(stop), *getattr(error, "__notes__", ())])
             return self._report(line, stop.exit_status)
         except NoackError as error:
-            removed = removal_in(self._words) if isinstance(error, CallerError) else None
-            return self._report(f"{NAME} {removed}" if removed else str(error), error.exit_status)
+            return self._report(str(error), error.exit_status)
         except Exception as error:
             reason = exhausted_limit(error) or why_not_written(error)
             if reason is None:
@@ -100,8 +98,6 @@ class Program(TyperGroup):
         message = _with_value(message.removeprefix("invalid value: "), self._words)
         if self._words and (missing := missing_extension("noack.commands", self._words[0])):
             return f"{NAME} {self._words[0]}: {missing}"
-        if removed := removal_in(self._words, getattr(error, "option_name", None)):
-            return f"{NAME} {removed}"
         name = next((word for word in self._words if word in self.commands), None)
         where, command = (f"{name}: ", f"{NAME} {name}") if name else ("", NAME)
         if option := getattr(error, "option_name", None):

@@ -22,7 +22,6 @@ from pydantic_core import ErrorDetails
 from noack.core.errors import TOO_LARGE, CallerError, did_you_mean, plain_mistake, printable, shortened, why
 from noack.core.extension_points import missing_extension
 from noack.core.file_access import read_regular
-from noack.scenario.removed_keys import removed_key
 from noack.settings.section import ReadTable, ScenarioSection, Table
 
 M = TypeVar("M", bound=ScenarioSection)
@@ -287,8 +286,6 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
     assignment = f"{key} = {show_value(value)}"
     if kind == "missing":
         return f"{key}: missing{_purpose(place.section, str(place.path[-1]))}"
-    if kind in ("extra_forbidden", "literal_error") and (line := _removal(key, value)):
-        return line
     if kind == "extra_forbidden":
         return f"{assignment}: unknown key; {_nearest(str(place.path[-1]), place.section)}"
     if kind == "value_error":
@@ -436,21 +433,11 @@ def _choice(key: str, value: object, place: _Place) -> str:
     if not isinstance(value, Mapping) or place.discriminator not in value:
         return f"{key}: missing; one of {choices_text}"
     chosen = value[place.discriminator]
-    if line := _removal(key, chosen):
-        return line
     if missing := missing_extension(_GROUPS.get(str(place.path[-1]), ""), str(chosen)):
         return f"{key} = {show_value(chosen)}: {missing}"
     close = difflib.get_close_matches(str(chosen), place.choices, n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
     return f"{key} = {show_value(chosen)}: must be one of {choices_text}{hint}"
-
-
-def _removal(key: str, value: object) -> str | None:
-    """Return the line about a key or kind that was removed, with the plain way; None if there is none."""
-    if (removed := removed_key(key, value)) is None:
-        return None
-    name, of_name, instead = removed
-    return f"{name} = {show_value(of_name)}: was removed; {instead}"
 
 
 def _table_example(value: object, place: _Place) -> str:
