@@ -109,7 +109,7 @@ ifneq (,$(filter test,$(MAKECMDGOALS)))
 MAKEFLAGS += --jobs=2 # what is checked does not wait for what is tested
 endif
 # What failed is remembered apart: with --last-failed, tests of another folder would all run again.
-EXTENSIONS := extensions --override-ini=cache_dir=.pytest_cache/extensions
+OF_EXTENSIONS := extensions --override-ini=cache_dir=.pytest_cache/extensions
 # The checks run beside the tests, which leave the processors idle at times; their lines come last.
 test: setup-dev ## Lint, types, import rules, and tests (ARGS are pytest's, e.g. ARGS="-k mansd")
 	@$(MAKE) --no-print-directory check >$(VENV)/.checks.txt 2>&1 & checks=$$!; \
@@ -119,14 +119,14 @@ test: setup-dev ## Lint, types, import rules, and tests (ARGS are pytest's, e.g.
 
 test-system: setup-dev ## Test what needs a browser, root or a system package, and other builds
 	$(BIN)/python -m pytest -m system --numprocesses=2 --dist=loadfile $(ARGS)
-	$(if $(ARGS),,$(BIN)/python -m pytest $(EXTENSIONS) -m system)
+	$(if $(ARGS),,$(BIN)/python -m pytest $(OF_EXTENSIONS) -m system)
 
 pytest: setup-dev
 	$(BIN)/python -m pytest \
 		$(or $(ARGS),-m "not system" --numprocesses=3 --dist=loadfile --no-loadscope-reorder)
 
 pytest-extensions: setup-dev
-	$(BIN)/python -m pytest $(EXTENSIONS) \
+	$(BIN)/python -m pytest $(OF_EXTENSIONS) \
 		$(or $(ARGS),-m "not system" --numprocesses=3 --dist=loadfile --no-loadscope-reorder)
 
 # With ARGS only the parsers, with N or MINUTES only whole scenarios.
