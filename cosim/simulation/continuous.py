@@ -104,32 +104,6 @@ class ContinuousLoop:
             **numbers,
         )
 
-    @property
-    def generator(self) -> Matrix:
-        """G of dz/dt = G z, per second, shape (3n, 3n)."""
-        loop = self.loop
-        zero = np.zeros_like(loop.H)
-        BK = loop.B @ loop.K
-        E = loop.A + BK - loop.H
-        return np.block([[loop.A + BK, zero, BK], [-E, loop.H, -BK], [-E, zero, loop.H - BK]])
-
-    @property
-    def decaying(self) -> TriggerRule:
-        """The trigger, which must be the paper's.
-
-        Raises:
-            CallerError: the policy is another one.
-        """
-        if not self.trigger.is_decaying:
-            raise CallerError(
-                'trigger.policy: with a continuous trigger (--trigger continuous) only "decaying" is searched'
-            )
-        return self.trigger
-
-    def threshold(self, t_s: float) -> float:
-        """Return max(βe^{−αt}, ε) of the paper's trigger."""
-        return self.decaying.threshold(t_s * 1e9)
-
     def norms(self, errors: Matrix) -> Vector:
         """‖W e‖ of k errors, shape (k, n) → (k,)."""
         W = self.trigger.weight
@@ -405,9 +379,10 @@ def document(run: ContinuousRun, resolved: Scenario) -> dict[str, object]:
 
 
 def _thresholds(run: ContinuousRun, samples: LoopSamples) -> list[float] | None:
-    if not run.system.trigger.is_decaying:
+    trigger = run.system.trigger
+    if not trigger.is_decaying:
         return None
-    return [run.system.threshold(t_s) for t_s in samples.t_s.tolist()]
+    return [trigger.threshold(1e9 * t_s) for t_s in samples.t_s.tolist()]
 
 
 class ContinuousSummary(NamedTuple):

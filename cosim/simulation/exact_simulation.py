@@ -56,23 +56,6 @@ class EventLog(NamedTuple):
     """(k, places, 3, n) just before the events; None: not wanted."""
 
 
-class Segments(NamedTuple):
-    """What follows k states up to their next event, before its reset, or to the horizon."""
-
-    t_s: Vector
-    states: NDArray[np.float64]
-    """(k, 3, n)"""
-    auxiliaries: Vector
-    """η or the integral, (k,)."""
-    events: NDArray[np.int64]
-    """1: an event, (k,)."""
-    values: Vector
-    """Of the measure, (k,); NaN of a run that fails."""
-    at_s: Vector
-    """When a supremum is attained, (k,)."""
-    statuses: NDArray[np.int64]
-
-
 class ExactSimulation:
     """What runs share, as the core's ``noack_exact``.
 
@@ -110,8 +93,7 @@ class ExactSimulation:
         self._rule = new_rule(trigger, n)
         settings = new_structure("noack_exact_settings", {
             "n": n, "m": m, "H": H, "K": K, "rule": self._rule, "horizon_s": horizon_s,
-            "known_start": known_start, "most_events": 2**62, "fading_per_s": trigger.fading_per_s,
-            "fading_until_s": np.inf, **numbers,
+            "known_start": known_start, "most_events": 2**62, "fading_per_s": trigger.fading_per_s, **numbers,
         })  # fmt: skip
         # The network: a link, or whether each update arrives.
         if link is not None:
@@ -164,35 +146,6 @@ class ExactSimulation:
                 ffi.new("noack_exact_log *", (places, event_s, arrived, states_of)),
             )
         return rows, log
-
-    def segments(
-        self,
-        A: Matrix,
-        B: Matrix,
-        t_s: Vector,
-        states: NDArray[np.float64],
-        auxiliaries: Vector | None = None,
-    ) -> Segments:
-        """Follow a plant from k states, (k, 3, n), just after events at times (k,)."""
-        k = len(t_s)
-        segments = Segments(
-            np.array(t_s, np.float64),
-            np.array(states, np.float64, order="C"),
-            np.zeros(k) if auxiliaries is None else np.array(auxiliaries, np.float64),
-            np.zeros(k, np.int64),
-            np.zeros(k),
-            np.zeros(k),
-            np.zeros(k, np.int64),
-        )
-        A, B = (np.ascontiguousarray(part, np.float64) for part in (A, B))
-        given = {name: _pointer(array) for name, array in segments._asdict().items()}
-        core.noack_exact_follow(
-            self.core,
-            _pointer(A),
-            _pointer(B),
-            ffi.new("noack_exact_segments *", {"count": k, **given}),
-        )
-        return segments
 
     def sample(
         self, A: Matrix, B: Matrix, start_s: Vector, starts: NDArray[np.float64], t_s: Vector

@@ -127,7 +127,7 @@ static const char *check(const noack_exact_settings *exact) {
     if (exact->H == NULL || exact->K == NULL)
         return "a simulation has no matrix";
     if (!is_finite_nonnegative(exact->horizon_s) || !is_finite_nonnegative(exact->settle)
-        || !is_finite_nonnegative(exact->fading_per_s) || !(exact->fading_until_s >= 0.0))
+        || !is_finite_nonnegative(exact->fading_per_s))
         return "a simulation has a time, a share or a rate below 0";
     if (!is_between(0, exact->most_events, INT64_MAX)
         || !is_between(NOACK_EXACT_ROW, exact->measure, NOACK_EXACT_TIMES))
@@ -281,16 +281,11 @@ void noack_exact_free(noack_exact *exact) {
     free(exact);
 }
 
-/* Copy a state (3, n) to a padded one, or back. */
+/* Copy a state (3, n) to a padded one. */
 static void pack(int64_t n, int64_t stride, const double *state, double *padded) {
     memset(padded, 0, 3 * (size_t)stride * sizeof *padded);
     for (int64_t i = 0; i < 3; i++)
         memcpy(padded + i * stride, state + i * n, (size_t)n * sizeof *state);
-}
-
-static void unpack(int64_t n, int64_t stride, const double *padded, double *state) {
-    for (int64_t i = 0; i < 3; i++)
-        memcpy(state + i * n, padded + i * stride, (size_t)n * sizeof *state);
 }
 
 void noack_exact_runs(
@@ -315,31 +310,6 @@ void noack_exact_runs(
         run.event = !exact->known_start;
         run.auxiliary = memory->dynamic ? exact->rule->initial : 0.0;
         code->follow(memory, &run);
-    }
-}
-
-void noack_exact_follow(
-    noack_exact *simulation, const double *A, const double *B, noack_exact_segments *segments) {
-    const noack_exact_settings *exact = &simulation->settings;
-    const exact_code *code = simulation->code;
-    exact_memory *memory = &simulation->memory;
-    int64_t n = exact->n, stride = code->stride;
-    double state[3 * NOACK_EXACT_ENTRIES];
-    code->prepare(memory, A, B);
-    for (int64_t i = 0; i < segments->count; i++) {
-        noack_exact_row row = {.inter_event_min_s = INFINITY};
-        double begin_s = segments->t_s[i], *own = segments->states + 3 * n * i;
-        exact_run run = {.row = &row, .stops = 1, .t_s = begin_s, .at_s = begin_s, .state = state};
-        run.auxiliary = segments->auxiliaries[i];
-        pack(n, stride, own, state);
-        code->follow(memory, &run);
-        unpack(n, stride, state, own);
-        segments->t_s[i] = run.t_s;
-        segments->auxiliaries[i] = run.auxiliary;
-        segments->events[i] = run.event;
-        segments->values[i] = exact->measure == NOACK_EXACT_COST ? row.cost : row.sup_e_c_scaled;
-        segments->at_s[i] = run.at_s;
-        segments->statuses[i] = row.status;
     }
 }
 

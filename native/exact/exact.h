@@ -75,17 +75,14 @@ typedef struct { /* memory of a simulation; arrays are in its scratch */
     double squares[2 * TERMS], g[MOST_TERMS], eta[MOST_TERMS];
 } exact_memory;
 
-typedef struct { /* a run, or a part of one */
+typedef struct { /* a run */
     noack_exact_row *row;
     int64_t number; /* of the run */
     const noack_exact_log *events;
-    int64_t stops;    /* 1: at its first event */
-    double t_s;       /* start, then end */
-    double *state;    /* (3, n) x, e_s, e_c at the start, then at the end */
-    double auxiliary; /* at the start, then at the end */
-    int64_t event;    /* 1: an event at t_s, at the start, then at the end */
+    double *state;    /* (3, n) x, e_s, e_c at the start */
+    double auxiliary; /* at the start */
+    int64_t event;    /* 1: an event at the start */
     int64_t losses;   /* consecutive ones so far */
-    double at_s;      /* time at which the supremum is attained */
     double growth;    /* e^(rt) of the supremum, at the start of a piece */
 } exact_run;
 

@@ -102,8 +102,8 @@ typedef struct { /* |y(s)| e^(rate s) growth on [0, end_s]; y is a curve of degr
     double end_s, rate, growth;
 } growing_norm;
 
-/* The norm, without growth, at or near a maximum to the right of low_s; *at_s is the time. */
-static double climb(const growing_norm *norm, double low_s, double *at_s) {
+/* The norm, without growth, at or near a maximum to the right of low_s. */
+static double climb(const growing_norm *norm, double low_s) {
     const int climbs = 12;
     const double *curve = norm->curve;
     int p = norm->p;
@@ -111,7 +111,6 @@ static double climb(const growing_norm *norm, double low_s, double *at_s) {
     curve_point at = point_at(curve, p, low_s);
     double low = dot(at.y, at.dy) + rate * dot(at.y, at.y);
     double best = sqrt(dot(at.y, at.y)) * fixed_exp(rate * low_s);
-    *at_s = low_s;
     at = point_at(curve, p, high_s);
     double high = dot(at.y, at.dy) + rate * dot(at.y, at.y);
     for (int i = 0; i < climbs; i++) {
@@ -123,7 +122,6 @@ static double climb(const growing_norm *norm, double low_s, double *at_s) {
         double square = dot(at.y, at.y), slope = dot(at.y, at.dy) + rate * square;
         double size = sqrt(square) * fixed_exp(rate * s);
         int rises = slope > 0.0 && size >= best;
-        *at_s = size > best ? s : *at_s;
         best = largest_of(best, size);
         if (rises) {
             low_s = s;
@@ -143,8 +141,7 @@ static double climb(const growing_norm *norm, double low_s, double *at_s) {
    (values below 1e-150 are ignored; values above 1e150 are infinite). A curve that stays close to
    one level, such as an oscillation, is searched again as the scalar |y|^2, in which cancelling
    terms vanish. */
-static double raise_supremum(
-    exact_memory *memory, const growing_norm *norm, double best, double *at_s) {
+static double raise_supremum(exact_memory *memory, const growing_norm *norm, double best) {
     const double smallest = 1e-150, too_large = 1e150;
     const double *curve = norm->curve;
     int p = norm->p;
@@ -165,7 +162,7 @@ static double raise_supremum(
             return best;
         if (s == UNRESOLVED)
             return UNRESOLVED;
-        double peak = climb(norm, s, at_s);
+        double peak = climb(norm, s);
         best = largest_of(best * (1.0 + CERTAINTY), peak * norm->growth);
     }
     return UNRESOLVED;

@@ -21,11 +21,8 @@ enum noack_exact_status {
 
 /* What is measured between events. */
 enum noack_exact_measure {
-    NOACK_EXACT_ROW,   /* all of a noack_exact_row */
-    NOACK_EXACT_ERROR, /* the supremum of |W e_c| e^(rt) */
-    NOACK_EXACT_STATE, /* the supremum of |x| e^(rt) */
-    NOACK_EXACT_COST,  /* the integral of x'Qx + u'Ru */
-    NOACK_EXACT_TIMES  /* nothing but the times of events */
+    NOACK_EXACT_ROW,  /* all of a noack_exact_row */
+    NOACK_EXACT_TIMES /* nothing but the times of events */
 };
 
 /* The measures of a run; NAN where a number is not defined. */
@@ -67,7 +64,6 @@ typedef struct {
     int64_t most_events;
     int64_t measure;         /* enum noack_exact_measure */
     double fading_per_s;     /* r of the supremum */
-    double fading_until_s;   /* r is 0 from this time on */
 } noack_exact_settings;
 
 /* The events of runs: a row of places for each. */
@@ -93,32 +89,12 @@ void noack_exact_runs(
     noack_exact *simulation, int64_t runs, const double *A, const double *B, const double *x0,
     const int64_t *keys, noack_exact_row *rows, const noack_exact_log *events);
 
-/* Segments of runs: from a state just after an event to the next event or the horizon. */
-typedef struct {
-    int64_t count;
-
-    /* At the start; then at the end */
-    double *t_s;         /* (count,) */
-    double *states;      /* (count, 3, n) at an event before its reset */
-    double *auxiliaries; /* (count,) eta or the integral of the trigger rule */
-
-    /* At the end, (count,) each */
-    int64_t *events;     /* 1: it ended by an event */
-    double *values;      /* of the measure; NAN if it fails */
-    double *at_s;        /* time of a supremum */
-    int64_t *statuses;   /* enum noack_exact_status */
-} noack_exact_segments;
-
 /* States of a plant at ascending times. */
 typedef struct {
     int64_t count;
     double *t_s;    /* (count,) */
     double *states; /* (count, 3, n) */
 } noack_exact_states;
-
-/* Follow a plant over segments. */
-void noack_exact_follow(
-    noack_exact *simulation, const double *A, const double *B, noack_exact_segments *segments);
 
 /* Fill samples with the states of a plant at their times, from the first start on. A start is a
    state just after an event; the last one up to a time applies. NAN where a million polynomials do

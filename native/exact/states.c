@@ -165,10 +165,9 @@ static double find_event(
     return phase->compares ? first_exit(memory->error, p, &search, crossing, MOST_STEPS) : NONE;
 }
 
-/* e^(rt) of the supremum; r is 0 from some time on. */
+/* e^(rt) of the supremum. */
 static double growth_at(const noack_exact_settings *exact, double t_s) {
-    double rate = exact->fading_per_s;
-    return rate > 0.0 ? fixed_exp(rate * least(t_s, exact->fading_until_s)) : 1.0;
+    return exact->fading_per_s > 0.0 ? fixed_exp(exact->fading_per_s * t_s) : 1.0;
 }
 
 typedef struct { /* a piece of a run, which has been followed */
@@ -181,31 +180,18 @@ typedef struct { /* a piece of a run, which has been followed */
 /* Raise a row's supremum by that of a piece with curves of degree q; return 0 if UNRESOLVED. */
 static int measure_supremum(exact_memory *memory, exact_run *run, const piece *done, int q) {
     const noack_exact_settings *exact = memory->exact;
-    double end_s = done->t_s + done->length_s;
-    int of_state = exact->measure == NOACK_EXACT_STATE, fades = done->t_s < exact->fading_until_s;
-    lanes last =
-        of_state ? plant_of(done->end) : weigh(memory->weight, controller_error(done->end));
-    growing_norm norm = {
-        .curve = of_state ? memory->x : memory->weighted,
-        .p = q,
-        .end_s = done->length_s,
-        .rate = fades ? exact->fading_per_s : 0.0,
-        .growth = run->growth,
-    };
-    run->growth = fades ? growth_at(exact, end_s) : norm.growth;
-    double end_growth = end_s <= exact->fading_until_s
-                            ? run->growth
-                            : norm.growth * fixed_exp(norm.rate * norm.end_s);
-    double earlier_sup = run->row->sup_e_c_scaled, at_s = norm.end_s, ceiling = INFINITY;
+    lanes last = weigh(memory->weight, controller_error(done->end));
+    growing_norm norm = {memory->weighted, q, done->length_s, exact->fading_per_s, run->growth};
+    run->growth = growth_at(exact, done->t_s + done->length_s);
+    double ceiling = INFINITY;
     if (done->bound != NULL)
         ceiling =
-            done->bound->threshold * (done->bound->rate_per_s > 0.0 ? norm.growth : end_growth);
-    double best = largest_of(earlier_sup, size_of(last) * end_growth);
+            done->bound->threshold * (done->bound->rate_per_s > 0.0 ? norm.growth : run->growth);
+    double best = largest_of(run->row->sup_e_c_scaled, size_of(last) * run->growth);
     if (!(ceiling <= best * (1.0 + CERTAINTY)))
-        best = raise_supremum(memory, &norm, best, &at_s);
+        best = raise_supremum(memory, &norm, best);
     if (best == UNRESOLVED)
         return 0;
-    run->at_s = best > earlier_sup ? done->t_s + at_s : run->at_s;
     run->row->sup_e_c_scaled = best;
     return 1;
 }
@@ -215,16 +201,12 @@ static int measure_supremum(exact_memory *memory, exact_run *run, const piece *d
 static double measure_piece(
     exact_memory *memory, exact_run *run, const piece *done, double settled) {
     noack_exact_row *row = run->row;
-    int64_t measure = memory->exact->measure;
-    int q = degree_for(memory->measured_s, done->length_s);
-    if (measure == NOACK_EXACT_ROW || measure == NOACK_EXACT_COST)
-        row->cost += square_integrals(memory, q, done->length_s);
-    if (measure == NOACK_EXACT_TIMES || measure == NOACK_EXACT_COST)
+    if (memory->exact->measure == NOACK_EXACT_TIMES)
         return NONE;
+    int q = degree_for(memory->measured_s, done->length_s);
+    row->cost += square_integrals(memory, q, done->length_s);
     if (!measure_supremum(memory, run, done, q))
         return UNRESOLVED;
-    if (measure != NOACK_EXACT_ROW)
-        return NONE;
     double within_s = last_above(memory->x, q, done->length_s, settled, plant_of(done->end));
     if (within_s >= 0.0)
         row->settling_s = done->t_s + within_s;
@@ -309,10 +291,9 @@ static progress begin(exact_memory *memory, exact_run *run) {
     if (memory->dynamic && memory->rule->decay_per_s > 0.0)
         farthest_s = least(farthest_s, SLOWEST / memory->rule->decay_per_s);
     memory->has_q = 0;
-    run->growth = growth_at(memory->exact, run->t_s);
+    run->growth = 1.0;
     return (progress){
         .state = state,
-        .t_s = run->t_s,
         .auxiliary = run->auxiliary,
         .last_s = -1.0,
         .settled = settled,
@@ -327,8 +308,6 @@ static progress begin(exact_memory *memory, exact_run *run) {
 /* Count the event at the present time, and reset the models. Return a status. */
 static int64_t take_event(exact_memory *memory, exact_run *run, progress *now) {
     int64_t earlier = run->row->transmissions;
-    if (run->stops)
-        return NOACK_EXACT_OK;
     if (earlier >= memory->exact->most_events || now->t_s <= now->last_s)
         return NOACK_EXACT_TOO_MANY_EVENTS;
     now->agree = count_event(memory, run, now->state, now->t_s, now->last_s);
@@ -413,8 +392,8 @@ follow_piece(exact_memory *memory, exact_run *run, progress *now) {
         now->t_s += passed_at(memory, spent_s, DIVERGED_NORM, &phase);
         return NOACK_EXACT_DIVERGED;
     }
-    int is_bounded = now->agree && !memory->quadratic && phase.compares && !memory->integrates
-                     && exact->measure != NOACK_EXACT_STATE; /* e_c = e_s */
+    int is_bounded =
+        now->agree && !memory->quadratic && phase.compares && !memory->integrates; /* e_c = e_s */
     piece done = {now->t_s, spent_s, now->state, is_bounded ? &phase : NULL};
     double within_s = measure_piece(memory, run, &done, now->settled);
     if (within_s == UNRESOLVED)
@@ -425,7 +404,7 @@ follow_piece(exact_memory *memory, exact_run *run, progress *now) {
     return GOES_ON;
 }
 
-/* Follow a run to its end, or to its first event. */
+/* Follow a run to its end. */
 static void follow(exact_memory *memory, exact_run *run) {
     progress now = begin(memory, run);
     int64_t status = now.farthest_s > 0.0 ? GOES_ON : NOACK_EXACT_UNDECIDED;
@@ -439,15 +418,8 @@ static void follow(exact_memory *memory, exact_run *run) {
     }
     if (status == GOES_ON)
         status = NOACK_EXACT_UNDECIDED;
-    loop_state state = now.state;
-    double span_s = now.last_s - now.first_s, size = size_of(plant_of(state));
+    double span_s = now.last_s - now.first_s, size = size_of(plant_of(now.state));
     finish_row(run->row, status, now.t_s, span_s, now.above, size);
-    run->t_s = now.t_s;
-    run->event = now.event;
-    run->auxiliary = now.auxiliary;
-    store(run->state, plant_of(state));
-    store(run->state + STRIDE, sensor_error(state));
-    store(run->state + 2 * STRIDE, controller_error(state));
 }
 
 /* Compute what all runs share. */

@@ -179,7 +179,7 @@ def test_random_batches_run_clean(seed: int, size_and_policy: tuple[int, str], m
 
 
 @settings(max_examples=40)
-@given(st.data(), st.integers(1, 9), st.sampled_from(range(5)), st.booleans())
+@given(st.data(), st.integers(1, 9), st.sampled_from(range(2)), st.booleans())
 def test_matrices_and_states_of_any_numbers_run_clean(
     data: st.DataObject, n: int, measure: int, area: bool
 ) -> None:
@@ -191,12 +191,11 @@ def test_matrices_and_states_of_any_numbers_run_clean(
 
     trigger = area_rule(0.1, n=n) if area else decaying_rule(0.5, 1.0, 0.1, n=n)
     simulation = ExactSimulation(
-        any_of(n, n), any_of(1, n), trigger, horizon_s=2.0, known_start=measure > 2,
+        any_of(n, n), any_of(1, n), trigger, horizon_s=2.0, known_start=measure > 0,
         delivered=np.array([True, False]), most_events=20, measure=measure,
     )  # fmt: skip
     A, B, x0 = any_of(2, n, n), any_of(2, n, 1), any_of(2, n)
     simulation.runs(A, B, x0, places=3, states=True)
-    simulation.segments(A[0], B[0], any_of(2), any_of(2, 3, n), any_of(2))
     t_s = np.sort(any_of(4))
     simulation.sample(A[0], B[0], t_s[:2], any_of(2, 3, n), t_s)
 

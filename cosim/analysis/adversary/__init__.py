@@ -8,8 +8,8 @@ reports it.
 """
 
 from cosim.analysis.adversary.loop_flows import Objective
-from cosim.analysis.adversary.scenario_search import find_worst, require_searchable
+from cosim.analysis.adversary.scenario_search import find_worst
 from cosim.analysis.adversary.simulated_search import find_worst_by_runs
 from cosim.analysis.adversary.worst_run import WorstRun
 
-__all__ = ["Objective", "WorstRun", "find_worst", "find_worst_by_runs", "require_searchable"]
+__all__ = ["Objective", "WorstRun", "find_worst", "find_worst_by_runs"]

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.adversary.loop_flows import Flags, Pattern, PatternFlow, SegmentEnds
+from cosim.analysis.adversary.loop_flows import Flags, Pattern, SampledFlow, SegmentEnds
 from cosim.simulation.continuous import TooManyEventsError
 from cosim.simulation.exact_simulation import MAX_EVENTS
 from noack.core.linear_systems import Matrix, Vector
@@ -53,7 +53,7 @@ class Nodes(NamedTuple):
         return Nodes._make(column[selection] for column in self)
 
 
-def start_nodes(flow: PatternFlow) -> Nodes:
+def start_nodes(flow: SampledFlow) -> Nodes:
     """Return the start of all runs."""
     start, zero = flow.start(), np.zeros(1, int)
     return Nodes(start.end_s, start.z, zero, start.value, zero + START)
@@ -96,7 +96,7 @@ class PatternSearch:
 
     def __init__(
         self,
-        flow: PatternFlow,
+        flow: SampledFlow,
         guarantee: LossGuarantee,
         report: SearchReport = lambda step, nodes, value: None,
     ) -> None:
@@ -171,7 +171,7 @@ class Step(NamedTuple):
     """The automaton's state after it, (k,)."""
 
 
-def after_events(flow: PatternFlow, step: Step, log: DecisionLog) -> Nodes:
+def after_events(flow: SampledFlow, step: Step, log: DecisionLog) -> Nodes:
     """Return the runs just after the events of a step, (k,); its decisions are added to the log.
 
     Raises:
@@ -186,17 +186,14 @@ def after_events(flow: PatternFlow, step: Step, log: DecisionLog) -> Nodes:
     return Nodes(t_s, z, step.state, step.value[continued], log.add(nodes.entry[continued], delivered))
 
 
-Ceiling = Callable[[Nodes], Vector]
-"""Returns an upper bound on the value that the rest of each run can add, (N,)."""
 _BLOCK = 4096
 """Runs that :func:`search_tree` follows at a time."""
 
 
-def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None = None) -> bool:
+def search_tree(search: PatternSearch, most_nodes: int) -> bool:
     """Search all patterns, within ``most_nodes`` nodes; return whether the maximum was found.
 
-    It was if all patterns were covered, or if one of them diverges. The ``ceiling`` prunes branches
-    that cannot exceed the largest value so far.
+    It was if all patterns were covered, or if one of them diverges.
 
     Raises:
         TooManyEventsError: two events at the same time.
@@ -205,8 +202,6 @@ def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None 
     pile = [start_nodes(search.flow)]
     while pile and search.value < float("inf"):
         nodes = _top(pile)
-        if ceiling is not None:
-            nodes = nodes.take(nodes.value + ceiling(nodes) > search.value)
         if search.nodes + len(nodes.t_s) > most_nodes:
             return False
         if len(nodes.t_s):
@@ -263,7 +258,7 @@ def search_beam(search: PatternSearch, width: int, window_s: float) -> None:
 class _RunSelection:
     """The selection of the runs that continue."""
 
-    def __init__(self, flow: PatternFlow, window_s: float) -> None:
+    def __init__(self, flow: SampledFlow, window_s: float) -> None:
         self._flow, self._window_s = flow, window_s
 
     def thin(self, nodes: Nodes, width: int) -> Nodes:
@@ -317,7 +312,7 @@ _PERIODS = 24
 
 
 def follow(
-    flow: PatternFlow, automaton: LossAutomaton, patterns: list[Pattern]
+    flow: SampledFlow, automaton: LossAutomaton, patterns: list[Pattern]
 ) -> tuple[Vector, list[Pattern]]:
     """Run patterns to the horizon; return their values and the applied decisions.
 

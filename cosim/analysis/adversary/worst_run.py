@@ -4,18 +4,17 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 
-import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.analysis.adversary.loop_flows import Measure, Objective, ObjectiveValue, Pattern
+from cosim.analysis.adversary.loop_flows import Objective, Pattern
 from cosim.analysis.adversary.worst_disturbances import disturbance_bounds
 from noack.core.clock import NS_PER_S
 from noack.core.number_format import NONE, at_least, at_most, duration, number
 from noack.guarantee.loss_guarantee import outcome_letters
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.certified_bounds import Quantity, ScenarioCertificate
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import network_delay_ns
 
 BREACH = 1 + 1e-9
@@ -26,8 +25,8 @@ BREACH = 1 + 1e-9
 class WorstRun:
     """The worst run found, for one objective.
 
-    In continuous time the values are Δ, X, ∫‖x‖² dt, and seconds between two events. In the
-    sampled loop Δ is not divided by β, and the bounds may have any shape instead of e^{−rt}.
+    The values are sup ‖W e_c‖ and sup ‖x‖, both scaled by the shape of their bounds, ∫‖x‖² dt, and
+    seconds between two events.
     """
 
     objective: Objective
@@ -99,39 +98,10 @@ def reported_value(value: float, objective: Objective) -> float | None:
     return None if value == -math.inf else -value
 
 
-def certified_value(
-    certificate: ScenarioCertificate, measure: Measure, horizon_s: float, value: ObjectiveValue
-) -> float | None:
-    """Return the certificate's bound on the same quantity at the same time."""
-    if measure.objective is Objective.INTER_EVENT:
-        return certificate.inter_event_s
-    quantity: Quantity = "e_c" if measure.objective is Objective.ERROR else "x"
-    if not certificate.has(quantity):
-        return None
-    if measure.objective is Objective.COST:
-        return _square_integral(certificate, horizon_s)
-    at_s = np.array([value.at_s or 0.0])
-    bound = float(certificate.bound(at_s, quantity)[0]) / float(measure.level(at_s)[0])
-    return bound if quantity == "x" else bound / measure.beta
-
-
-def _square_integral(certificate: ScenarioCertificate, until_s: float) -> float:
-    """Return ∫(D₁e^{−rt} + D₂)² dt up to ``until_s``."""
-    assert certificate.proven is not None
-    rate, (decaying, constant) = certificate.proven.rate_per_s, certificate.proven.bounds["x"]
-
-    def integral(rate_per_s: float) -> float:
-        return -math.expm1(-rate_per_s * until_s) / rate_per_s if rate_per_s else until_s
-
-    once, twice = integral(rate), integral(2 * rate)
-    return decaying**2 * twice + 2 * decaying * constant * once + constant**2 * until_s
-
-
 def document(
     results: Sequence[WorstRun],
     resolved: Scenario,
     certificate: ScenarioCertificate,
-    trigger: str,
     shares: Mapping[str, float],
 ) -> dict[str, object]:
     """Return the results as JSON; ``shares`` are those of their bounds that outputs have, by their names."""
@@ -139,7 +109,7 @@ def document(
         "scenario": resolved.name,
         "mode": resolved.mode,
         "policy": resolved.trigger.policy,
-        "trigger": trigger,
+        "trigger": "sampled",
         "mansd": resolved.network.mansd,
         "guarantee": resolved.network.guarantee.meaning,
         "horizon_s": resolved.horizon_s,
@@ -154,7 +124,6 @@ def print_worst(
     results: Sequence[WorstRun],
     resolved: Scenario,
     certificate: ScenarioCertificate,
-    trigger: str,
     shares: Mapping[str, float],
 ) -> None:
     """Print the results and their loss patterns, and the shares of their bounds that outputs have."""
@@ -168,7 +137,7 @@ def print_worst(
         is_lower = worst.objective is Objective.INTER_EVENT
         certified = at_least(worst.certified) if is_lower else at_most(worst.certified)
         table.add_row(
-            _quantity(worst.objective, certificate, trigger, weighted=resolved.trigger.weight is not None),
+            _quantity(worst.objective, certificate, weighted=resolved.trigger.weight is not None),
             *(number(value, 4) for value in (worst.lossless, worst.with_own_network, worst.value)),
             certified,
             "[bold red]exceeded[/]" if worst.breaches else _share_used(worst.tightness),
@@ -185,15 +154,15 @@ def print_worst(
         outcome = "the loop diverges" if worst.diverges else f"{time_text}{coverage} ({speed})"
         console.print(f"{worst.objective.value}: {outcome}")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
-    for note in _notes(resolved, trigger):
+    for note in _notes(resolved):
         console.print(note)
     if any(worst.tightness is not None for worst in results):
         console.print("[dim]share used: of the certified bound, by the worst losses[/]")
-    if trigger == "sampled" and _is_shaped(certificate):
+    if _is_shaped(certificate):
         console.print("[dim]Scaled: multiplied by bound(0) / bound(t)[/]")
     if certificate.void is not None and not certificate.exists:
         console.print(f"[dim]Nothing is certified: {escape(certificate.void)}[/]")
-    elif trigger == "sampled":
+    else:
         console.print("[dim]certified: proved for the scenario's schedule[/]")
     console.print("[dim]One letter per event: D delivered, L lost. --json prints their times[/]")
 
@@ -202,12 +171,10 @@ def _share_used(share: float | None) -> str:
     return NONE if share is None else f"{100 * share:.4g} %"
 
 
-def _notes(resolved: Scenario, trigger: str) -> Iterator[str]:
+def _notes(resolved: Scenario) -> Iterator[str]:
     """Yield what the values assume besides the losses."""
     if not resolved.network.enforce_mansd:
         yield "[yellow]Nothing enforces this limit of the losses: the network may lose more[/]"
-    if trigger != "sampled":
-        return
     if not resolved.coverage.is_undisturbed:
         yield "[dim]Disturbances and noise are drawn from the seeds[/]"
         if disturbance_bounds(resolved) is not None:
@@ -217,16 +184,15 @@ def _notes(resolved: Scenario, trigger: str) -> Iterator[str]:
         yield f"[dim]Every delivered update takes the longest delay that is certified, {longest}[/]"
 
 
-def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str, *, weighted: bool) -> str:
-    sampled = trigger == "sampled"
+def _quantity(objective: Objective, certificate: ScenarioCertificate, *, weighted: bool) -> str:
     rate = 0.0 if certificate.proven is None else certificate.proven.rate_per_s
     growth = f" e^({rate:.3g}t)" if rate else ""
-    if sampled and _is_shaped(certificate):
+    if _is_shaped(certificate):
         growth = ", scaled"
     error = "‖W e_c‖" if weighted else "‖e_c‖"
     return {
-        Objective.ERROR: f"{error}{growth}" if sampled else f"Δ: {error}{growth} / β",
-        Objective.STATE: f"‖x‖{growth}" if sampled else f"X: ‖x‖{growth}",
+        Objective.ERROR: f"{error}{growth}",
+        Objective.STATE: f"‖x‖{growth}",
         Objective.COST: "∫ ‖x‖² dt",
         Objective.INTER_EVENT: "inter-event time, s",
     }[objective]

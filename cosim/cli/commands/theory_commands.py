@@ -139,7 +139,6 @@ class AdversaryAim(StrEnum):
         ("noack adversary lane_following", "all objectives"),
         ("noack adversary lane_following --objective error --json", "the controller's error only"),
         ("noack adversary unstable_pendulum --horizon 2 --beam 64", "a faster search"),
-        ("noack adversary lane_following --trigger continuous", "the paper's loop, in exact time"),
     ),
 )
 def adversary(
@@ -167,12 +166,10 @@ def adversary(
         ),
     ] = 500_000,
     beam: Annotated[int, Option(min=0, help="Width of the beam search, in runs.")] = 512,
-    trigger: opt.TriggerOption = opt.TriggerMode.SAMPLED,
     json: opt.JsonOption = False,
 ) -> int:
     """Search for the worst losses that the network may cause; compare them with the bounds.
 
-    The loop is that of the processes; with --trigger continuous it is the paper's, without delays.
     Exit status 1: a certified bound was exceeded.
 
     Takes some 20 s if all patterns can be tried; otherwise about as long for each objective. Of a plant
@@ -180,8 +177,8 @@ def adversary(
     """
     from cosim.analysis import adversary as adversary_search
     from cosim.analysis.adversary.worst_run import BREACH, WorstRun, document, print_worst
-    from cosim.cli.execute_run import warn_of_left_out
     from cosim.live.monitoring.progress import search_activity
+    from cosim.simulation.sampled_loop import SampledLoop
     from noack.scenario.resolution import resolve
 
     try:
@@ -192,13 +189,10 @@ def adversary(
             raise
         line = str(error).replace("--set horizon_s =", "--horizon")
         raise CallerError(line.replace("--set horizon_s", "--horizon")) from None
-    continuous = trigger is opt.TriggerMode.CONTINUOUS
-    if continuous:
-        warn_of_left_out(resolved)
-    by_runs = not continuous and not resolved.coverage.is_linear
+    by_runs = not resolved.coverage.is_linear
     if not by_runs:
-        adversary_search.require_searchable(resolved, continuous=continuous)
-    certificate = _certificate_to_compare(resolved, ideal=continuous)
+        SampledLoop(resolved)  # refuses what cannot be searched
+    certificate = _certificate_to_compare(resolved)
     if by_runs and not certificate.exists:
         raise CallerError(f"no certificate: {certificate.void}")
     kinds, is_all = adversary_search.Objective, objective is AdversaryAim.ALL
@@ -216,7 +210,6 @@ def adversary(
                 worst = adversary_search.find_worst(
                     resolved,
                     aim,
-                    continuous=continuous,
                     most_nodes=nodes,
                     beam=beam,
                     certificate=certificate,
@@ -228,9 +221,9 @@ def adversary(
             raise
         stopped = stop
     if json:
-        print_json(document(worst_cases, resolved, certificate, trigger.value, shares))
+        print_json(document(worst_cases, resolved, certificate, shares))
     else:
-        print_worst(console(), worst_cases, resolved, certificate, trigger.value, shares)
+        print_worst(console(), worst_cases, resolved, certificate, shares)
     if stopped is not None:
         missing = ", ".join(aim.value for aim in aims[len(worst_cases) :])
         print_to_stderr(f"noack: {stopped}; missing: {missing}")
@@ -239,14 +232,14 @@ def adversary(
     return ExitStatus.FAILED if is_exceeded else ExitStatus.OK
 
 
-def _certificate_to_compare(resolved: "Scenario", *, ideal: bool) -> "ScenarioCertificate":
+def _certificate_to_compare(resolved: "Scenario") -> "ScenarioCertificate":
     """Return the certificate of the scenario's own plant, as ``noack certify`` proves it."""
     from cosim.analysis.certificates import Certificates
     from cosim.live.monitoring.progress import work_bar
 
     results = Certificates(resolved)
     with work_bar("searching for proofs", lines=True) as bar:
-        results.prove(bar, conditions=("ideal",) if ideal else ("schedule",))
+        results.prove(bar, conditions=("schedule",))
     (_, certificate), *_ = results
     return certificate
 

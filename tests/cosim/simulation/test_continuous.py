@@ -83,11 +83,11 @@ def test_the_threshold_is_reached_at_events_only_and_i1_holds_between_them(case:
     run, H = case.run(), case.loop.H
     t_s = np.linspace(0, run.reached_s, 101)
     samples = run.at(t_s)
-    levels = np.array([run.system.threshold(t) for t in t_s])
+    levels = np.array([run.system.trigger.threshold(1e9 * t) for t in t_s])
     assert (run.e_s_norm(samples) <= levels * (1 + 1e-12)).all()
     for state in run.before[0 if case.known else 1 :]:
         norm = run.system.norms(state.e_s[None])[0]
-        assert norm == pytest.approx(run.system.threshold(state.t_s), rel=1e-12)
+        assert norm == pytest.approx(run.system.trigger.threshold(1e9 * state.t_s), rel=1e-12)
     received = -1
     for i, t in enumerate(t_s):
         happened = int(np.searchsorted(run.event_s, t, side="right"))
