@@ -205,21 +205,25 @@ $(VENV)/bin/python:
 	@$(PYTHON) tools/with_progress.py "making $(VENV) with $(PYTHON)" $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "noack needs Python's venv module (Debian: apt-get install python3-venv)" >&2; exit 2; }
 
+# It builds if a source has changed, else it does nothing. Exit status 3: there is no C compiler.
+define BUILD_CORE
+	$(SAY) --late "building the core" $(BIN)/python native/build.py $(1) || { status=$$?; [ $$status = 3 ] || exit $$status; \
+		$(SAY) "no C compiler here: installing ziglang, which has one" $(PIP) --no-compile -r requirements-compiler.lock && \
+		$(SAY) --late "building the core" $(BIN)/python native/build.py $(1); }
+endef
+
 $(VENV)/.dependencies: requirements.lock | $(VENV)/bin/python
 	@# On another core meanwhile the library in C; the target core reports what fails of it.
-	@$(BIN)/python native/build.py --library > /dev/null 2>&1 & \
-		$(SAY) "installing pinned dependencies" $(PIP) --no-compile -r requirements.lock; status=$$?; wait; exit $$status
-	@# pip would do it on one core.
-	@$(SAY) "compiling their modules" $(BIN)/python -m compileall -q -q -j 0 $(VENV)/lib || true
+	@# pip would compile the modules on one core. Nobody runs the packages' own tests.
+	@{ $(call BUILD_CORE,--library); } 2> /dev/null & \
+		$(SAY) "installing pinned dependencies" $(PIP) --no-compile -r requirements.lock && \
+		{ $(SAY) "compiling their modules" $(BIN)/python -m compileall -q -q -j 0 -x '/tests/' $(VENV)/lib || true; }; \
+		status=$$?; wait; exit $$status
 	@touch $@
 
-# It builds if a source has changed, else it does nothing. Exit status 3: there is no C compiler.
 .PHONY: core
 core: $(VENV)/.dependencies
-	@$(SAY) --late "building the core" $(BIN)/python native/build.py 2> $(VENV)/build.log || { status=$$?; \
-		[ $$status = 3 ] || { cat $(VENV)/build.log >&2; exit $$status; }; \
-		$(SAY) "no C compiler here: installing ziglang, which has one" $(PIP) -r requirements-compiler.lock && \
-		$(SAY) --late "building the core" $(BIN)/python native/build.py; }
+	@$(BUILD_CORE)
 
 $(VENV)/.installed: $(VENV)/.dependencies pyproject.toml | core
 	@$(SAY) --late "installing noack" $(EDITABLE)
