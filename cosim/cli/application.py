@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 from typer.core import TyperGroup
-from typer.main import get_group
+from typer.main import get_command_name, get_group
 
 from cosim.cli.options import PANELS, examples
 from noack.core.errors import CallerError, ExitStatus, NoackError, plain_mistake, printable, why
@@ -198,20 +198,32 @@ def global_options(
 
 def _add_commands() -> None:
     """Add the commands of all modules that have some, each of a name that no other has."""
-    names: set[str] = set()
+    for commands in parts("cosim.cli.commands", "", _commands_in):
+        app.add_typer(commands)
+    names = {
+        get_command_name(info.name or getattr(info.callback, "__name__", ""))
+        for group in app.registered_groups
+        for info in getattr(group.typer_instance, "registered_commands", ())
+    }
 
     def read(module: ModuleType) -> typer.Typer | None:
-        commands = getattr(module, "app", None)
-        if not isinstance(commands, typer.Typer):
+        commands = _commands_in(module)
+        if commands is None:
             return None
-        group = get_group(commands)  # raises an error if typer cannot use a function
+        # An error if typer cannot use a function. Noack's own are built once, when the program runs.
+        group = get_group(commands)
         if taken := names & group.commands.keys():
             raise CallerError(f"there is a command {min(taken)} already")
         names.update(group.commands)
         return commands
 
-    for commands in parts("cosim.cli.commands", "noack.commands", read):
+    for commands in parts(None, "noack.commands", read):
         app.add_typer(commands)
+
+
+def _commands_in(module: ModuleType) -> typer.Typer | None:
+    commands = getattr(module, "app", None)
+    return commands if isinstance(commands, typer.Typer) else None
 
 
 _add_commands()
