@@ -30,6 +30,7 @@
 /* 73 years: packets that must pass may exceed a queue's size. */
 #define LATEST_NS (INT64_C(1) << 61)
 
+enum { LINE_BYTES = 64 };    /* of the processor's caches */
 enum { MOST_LOOPS = 65535 }; /* of a run: datagrams have the number of the loop in 16 bits */
 
 static inline int64_t max_of(int64_t a, int64_t b) { return a > b ? a : b; }
@@ -185,6 +186,10 @@ int happens(const noack_chance *chance, noack_stage_memory *memory, double u);
 void queue_occupy(noack_link *link, int64_t stage, int64_t until_ns);
 int codel_is_due(const noack_link *link, int64_t stage);
 void codel_drop(noack_link *link, int64_t stage);
+
+/* loop/process.c: let the processor fetch the memory of a machine, which is needed soon. Without it
+   the step of one of a thousand loops waits for it. */
+void fetch_machine(const noack_process *process, int64_t loop);
 
 /* clock.c, and driver.c: readings of a clock. */
 int64_t noack_simulated_ns_of(const noack_clock *clock, int64_t wall_ns);

@@ -3,8 +3,6 @@
 
 #include "core.h"
 
-enum { LINE_BYTES = 64 }; /* of the caches */
-
 void *zeros(int64_t count, size_t size) { return calloc((size_t)max_of(count, 1), size); }
 
 void *copy_of(const void *elements, int64_t count, size_t size) {

@@ -12,9 +12,9 @@
 #include <unistd.h>
 
 enum {
-    TICKS = 64,         /* that are done before it receives again */
-    MANY_BYTES = 98304, /* of rows: as many go to the recorder without a pause */
-    EARLY_NS = 1000     /* a timer may expire so much before its time */
+    TICKS = 64,          /* that are done before it receives again */
+    MANY_BYTES = 393216, /* of rows: a thousand loops at 50 Hz write fewer until housekeeping */
+    EARLY_NS = 1000      /* a timer may expire so much before its time */
 };
 
 int64_t clock_ns(int clock) {
@@ -88,6 +88,13 @@ static int64_t reason_of(int64_t question) {
     return question == NOACK_ROWS_FULL ? NOACK_DRIVER_ROWS : NOACK_DRIVER_FAILED;
 }
 
+/* Let the processor fetch the machine to which a datagram that was received goes. */
+static void fetch_machine_of(const noack_driver *driver, int64_t place) {
+    const arrival *next = &scratch_of(driver)->arrivals[place];
+    if (place < scratch_of(driver)->in_end)
+        fetch_machine(driver->process, max_of(noack_wire_loop(next->data, next->size_bytes), 0));
+}
+
 /* Examine the current datagram; return NOACK_DRIVER_OPEN if it must be opened. */
 static int64_t examine(noack_driver *driver) {
     driver_scratch *scratch = scratch_of(driver);
@@ -95,6 +102,7 @@ static int64_t examine(noack_driver *driver) {
     uint8_t *datagram = current->data;
     int64_t size_bytes = current->size_bytes;
     int64_t loop = noack_wire_loop(datagram, size_bytes);
+    fetch_machine_of(driver, scratch->in_next + 1);
     int is_answer = driver->sources[1].name_bytes > 0
                     && noack_wire_flow(datagram, size_bytes) == NOACK_ACKNOWLEDGEMENT;
     if (loop >= driver->process->loops) /* rejected by the first loop */

@@ -7,6 +7,8 @@
 #include <math.h>
 #include <stdlib.h>
 
+enum { FETCHED_BYTES = 896 }; /* of a machine: more than a plant of two states has */
+
 /* Which word of a loop's own row each word of a row of the table is; NULL: they are the same. */
 static const int64_t *layout_of(const noack_table *table, int64_t loop) {
     int64_t words = (table->row_bytes - NOACK_LOOP_BYTES) / 8;
@@ -15,6 +17,14 @@ static const int64_t *layout_of(const noack_table *table, int64_t loop) {
 
 noack_machine *noack_process_machine(const noack_process *process, int64_t loop) {
     return process->machines[loop];
+}
+
+void fetch_machine(const noack_process *process, int64_t loop) {
+    if (loop >= process->loops)
+        return;
+    const uint8_t *memory = (const uint8_t *)process->machines[loop];
+    for (int offset = 0; offset < FETCHED_BYTES; offset += LINE_BYTES)
+        __builtin_prefetch(memory + offset);
 }
 
 static void push_tick(noack_process *process, int64_t loop) {
@@ -111,6 +121,8 @@ int64_t noack_process_tick(noack_process *process, int64_t now_ns) {
     if (question == NOACK_DONE) {
         noack_heap_pop(process->heap, &process->heap_count);
         push_tick(process, loop);
+        if (process->heap_count > 0)
+            fetch_machine(process, process->heap[0].number);
     }
     return keep_outputs(process, loop, question);
 }
