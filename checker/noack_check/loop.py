@@ -88,15 +88,26 @@ class Times(NamedTuple):
 class Observer(NamedTuple):
     """An observer in the sensor, for a plant that has the matrices A and B that it uses.
 
-    At each test its error becomes I − LC times that of the prediction, plus the noise of the test.
+    At each test its error becomes I − LC times that of the prediction, plus L times the noise of the test. Of
+    each gain a ball is known.
     """
 
-    correction: arb_mat  # I − LC, (n, n)
-    first_correction: arb_mat  # the same at the first test
+    gains: tuple[arb_mat, ...]  # L at the first tests, (n, p); the last one has those at all later ones
+    outputs: arb_mat  # C, (p, n)
     start: arb_mat  # x̂ − x before the first test, at t = 0, (n, 1)
     period: fmpq  # T, s, exactly between two tests
     unfelt: int = 0
     """So many disturbances, the last ones, are those of a reference: it predicts them exactly, too."""
+
+    def correction(self, test: int) -> arb_mat:
+        """Return I − LC at a test, (n, n)."""
+        gain = self.gains[min(test, len(self.gains) - 1)]
+        return identity(gain.nrows()) - gain * self.outputs
+
+    @property
+    def last_correction(self) -> arb_mat:
+        """I − LC at all tests but the first ones, (n, n)."""
+        return self.correction(len(self.gains))
 
 
 class Smooth(NamedTuple):
@@ -105,6 +116,11 @@ class Smooth(NamedTuple):
     columns: arb_mat  # S, (n, q)
     rates: arb_mat  # Λ, (q, q)
     start: arb_mat  # s(0), (q, 1)
+
+
+def no_smooth(n: int) -> Smooth:
+    """Return the part without entries."""
+    return Smooth(zeros(n, 0), zeros(0, 0), zeros(0, 1))
 
 
 class Noise(NamedTuple):
@@ -147,7 +163,8 @@ class Loop(NamedTuple):
     rule: Rule
     pushes: arb_mat  # columns D of disturbances, (n, k)
     sizes: tuple[arb, ...]  # |d_i| ≤ sizes[i]
-    noise: arb_mat  # columns of the noise of tests, (n, k): Σ column p with |p_i| ≤ 1 for each
+    noise: arb_mat
+    """Columns of the noise of tests, (n, k), or (p, k) of p outputs: Σ column p with |p_i| ≤ 1 for each."""
     losses: int  # most consecutive losses, M − 1
     times: Times
     observer: Observer | None = None
@@ -177,11 +194,16 @@ class Loop(NamedTuple):
         return int(self.A.nrows())
 
     @property
+    def measured(self) -> int:
+        """Number of entries of a measurement."""
+        return self.n if self.observer is None else int(self.observer.outputs.nrows())
+
+    @property
     def plain_noise(self) -> Noise:
         """Bounds of n without an observer."""
         n, rows = self.n, (self.weight * self.noise).tolist() if self.noise.ncols() else []
         size = frobenius(arb_mat(1, len(rows), [sum((abs(entry) for entry in row), arb(0)) for row in rows]))
-        return Noise(self.noise, 0, Smooth(zeros(n, 0), zeros(0, 0), zeros(0, 1)), (arb(0), size))
+        return Noise(self.noise, 0, no_smooth(n), (arb(0), size))
 
     @property
     def needs_constant(self) -> bool:
@@ -229,16 +251,17 @@ class Loop(NamedTuple):
         shapes = {
             "A": (n, n), "B": (n, m), "half_A": (n, n), "half_B": (n, m), "model_A": (n, n),
             "model_B": (n, m), "gain": (m, n), "weight": (n, n), "start": (n, 1), "pushes": (n, k),
-            "noise": (n, self.noise.ncols()), "outputs": (self.output_rows.nrows(), n),
+            "noise": (self.measured, self.noise.ncols()), "outputs": (self.output_rows.nrows(), n),
         }  # fmt: skip
         matrices = {name: getattr(self, name) for name in shapes if name != "outputs"} | {
             "outputs": self.output_rows,
             "rule.positive": rule.positive, "rule.negative": rule.negative,
         }  # fmt: skip
         if self.observer is not None:
-            shapes |= {"correction": (n, n), "first correction": (n, n), "first estimate": (n, 1)}
-            matrices |= {"correction": self.observer.correction, "first estimate": self.observer.start}
-            matrices |= {"first correction": self.observer.first_correction}
+            shapes |= {"measured": (self.measured, n), "first estimate": (n, 1)}
+            matrices |= {"measured": self.observer.outputs, "first estimate": self.observer.start}
+            for i, gain in enumerate(self.observer.gains):
+                shapes[f"gain {i}"], matrices[f"gain {i}"] = (n, self.measured), gain
         if self.push_before_input is not None:
             shapes["push"], matrices["push"] = (n, 1), self.push_before_input
         compared = n + m if rule.of_input else 2 * n
@@ -279,6 +302,8 @@ class Loop(NamedTuple):
                 return "observer: its model may not be the plant"
             if not 0 <= self.observer.unfelt <= k:
                 return "observer: it predicts more disturbances than there are"
+            if not self.observer.gains:
+                return "observer: no gain"
             if not (times.sampling > 0 and self.observer.period > 0):
                 return "observer: without tests at times"
         if self.along and [(a.row.nrows(), a.row.ncols()) for a in self.along] != [(1, n + m)] * k:

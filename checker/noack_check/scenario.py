@@ -5,6 +5,7 @@ refuses has no loop. A reference, or a set-point, which is a constant one, is mo
 :mod:`.reference`.
 """
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
@@ -26,6 +27,7 @@ from noack_check.balls import (
 )
 from noack_check.document import read_table
 from noack_check.equations import LinearPlants, enclose, read_region
+from noack_check.kalman import KalmanFilter
 from noack_check.keys import RefusedError, Table, refusals
 from noack_check.loop import Along, Loop, Memory, Observer, Region, Rule, Times
 from noack_check.norms import lyapunov_function, spectral_norm
@@ -762,30 +764,23 @@ def _disturbances(plant: Table, B: arb_mat, half_B: arb_mat) -> Iterator[list[ar
 
 
 def _noise(resolved: Table, n: int) -> arb_mat:
-    """Return the columns of the noise of measurements, or of what an observer adds to x̂ by it."""
-    through = matrix([[int(i == k) for k in range(n)] for i in range(n)])
-    if "observer" in resolved:
-        through, _ = _observed(resolved, n)
-    measurement, p = _optional_table(_table(resolved, "plant"), "measurement"), through.ncols()
-    name = "plant.measurement.noise_bound"
+    """Return the columns of the noise of measurements, of all outputs with an observer."""
+    measurement = _optional_table(_table(resolved, "plant"), "measurement")
+    p, name = len(_measured(resolved, n)), "plant.measurement.noise_bound"
     sizes = _row(measurement, name) if "noise_bound" in measurement else [0.0] * p
     if len(sizes) != p or min(sizes) < 0:
         raise RefusedError(f"{name}: not {p} numbers of at least 0")
     if any(sizes):
         _require_unknown_start(resolved, "noise")
     bounds = matrix([[size * (i == k) for k in range(p)] for i, size in enumerate(sizes)])
-    return columns_of(through * bounds, [i for i, size in enumerate(sizes) if size > 0])
+    return columns_of(bounds, [i for i, size in enumerate(sizes) if size > 0])
 
 
-def _observed(resolved: Table, n: int) -> tuple[arb_mat, arb_mat]:
-    """Return the observer's gain L, (n, p), and the output's matrix C, (p, n)."""
-    gain = _matrix(_table(resolved, "observer"), "observer.gain")
+def _measured(resolved: Table, n: int) -> Rows:
+    """Return the rows of C in y = Cx + v."""
     measurement = _optional_table(_table(resolved, "plant"), "measurement")
     every = [[int(i == j) for j in range(n)] for i in range(n)]
-    C = _matrix(measurement, "plant.measurement.C") if "C" in measurement else every
-    if len(gain) != n or len(C[0]) != n or len(C) != len(gain[0]):
-        raise RefusedError("observer.gain: not a row for each state, and a column for each output")
-    return matrix(gain), matrix(C)
+    return _wide(measurement, "plant.measurement.C", n) if "C" in measurement else every
 
 
 def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | None:
@@ -800,21 +795,43 @@ def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | No
     n, schedule = len(plants.A), read_schedule(resolved)
     if ideal or not schedule.is_whole:
         raise RefusedError("observer: not covered without tests a whole number of nanoseconds apart")
-    _choice(observer, "observer.kind", ("luenberger",))
-    (L, C), x_0 = _observed(resolved, n), _row(plant, "plant.initial_state")
+    x_0, rows = _row(plant, "plant.initial_state"), _measured(resolved, n)
+    C = matrix(rows)
     estimate = _row(observer, "observer.initial_estimate") if "initial_estimate" in observer else [0.0] * n
     if len(estimate) != n:
         raise RefusedError(f"observer.initial_estimate: not {n} numbers")
     start = matrix([[value] for value in estimate]) - matrix([[value] for value in x_0])
-    correction = first_correction = identity(n) - L * C
-    if "first_gain" in observer:
-        first = matrix(_matrix(observer, "observer.first_gain"))
-        if (first.nrows(), first.ncols()) != (n, C.nrows()):
-            raise RefusedError("observer.first_gain: not a row for each state, and a column for each output")
-        if _noise(resolved, n).ncols():
-            raise RefusedError("observer.first_gain: not covered with noise")
-        first_correction = identity(n) - first * C
-    return Observer(correction, first_correction, start, fmpq(int(schedule.sample), NS_PER_S))
+    if _choice(observer, "observer.kind", ("luenberger", "kalman")) == "kalman":
+        gains = _kalman_gains(resolved, plants.A, rows)
+    else:
+        names = ["first_gain", "gain"] if "first_gain" in observer else ["gain"]
+        gains = tuple(matrix(_matrix(observer, f"observer.{name}")) for name in names)
+        for name, gain in zip(names, gains, strict=True):
+            if (gain.nrows(), gain.ncols()) != (n, C.nrows()):
+                raise RefusedError(f"observer.{name}: not a row for each state, and a column for each output")
+    return Observer(gains, C, start, fmpq(int(schedule.sample), NS_PER_S))
+
+
+def _kalman_gains(resolved: Table, A: Rows, C: Rows) -> tuple[arb_mat, ...]:
+    """Return the gains of the Kalman filter in the sensor; see :meth:`.kalman.KalmanFilter.gains`."""
+    observer, schedule = _table(resolved, "observer"), read_schedule(resolved)
+    std = _row(observer, "observer.initial_std")
+    start = [[number(value) ** 2 * int(i == j) for j in range(len(std))] for i, value in enumerate(std)]
+    h = fmpq(int(schedule.step), NS_PER_S)
+    Q, R = (_matrix(observer, f"observer.{key}") for key in ("Q", "R"))
+    key = json.dumps([A, C, Q, R, std, str(h), str(schedule.sample)])
+    if key not in _gains:
+        if len(_gains) >= _MOST_GAINS:
+            del _gains[next(iter(_gains))]
+        steps = int(schedule.sample / schedule.step)
+        flow = (arb(h) * matrix(A)).exp()
+        _gains[key] = KalmanFilter(flow, matrix(Q), steps, matrix(C), matrix(R), arb_mat(start)).gains()
+    return _gains[key]
+
+
+_MOST_GAINS = 16
+_gains: dict[str, tuple[arb_mat, ...]] = {}
+"""Those of the last filters: a search reads a scenario many times."""
 
 
 def _require_unknown_start(resolved: Table, what: str) -> None:

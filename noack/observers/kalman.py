@@ -24,7 +24,7 @@ from pydantic import model_validator
 from noack.core.core_library import core, pointer_to, reals_at
 from noack.core.linear_systems import Matrix
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
-from noack.settings.section import Deviations, MatrixRows, require_length, require_shape
+from noack.settings.section import Deviations, MatrixRows, require_length, require_shape, rows_of
 
 
 class KalmanSettings(ObserverSettings):
@@ -102,6 +102,11 @@ class KalmanSettings(ObserverSettings):
         elif self.noise_std is not None:
             R = np.diag(np.square(self.noise_std))
         return model._replace(Q=Q, R=R)
+
+    def stated(self, assumed: EstimationModel) -> Self:
+        Q, R = (rows_of((M + M.T) / 2) for M in (assumed.Q, assumed.R))
+        given = {"process_std": None, "input_std": None, "noise_std": None}
+        return self.model_copy(update={**given, "Q": Q, "R": R})
 
     def steady_gain(self, assumed: EstimationModel) -> Matrix | None:
         """Return L from the discrete algebraic Riccati equation; None if its solver fails."""

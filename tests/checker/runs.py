@@ -4,6 +4,7 @@ Nothing of the checker's model is used: x, x_s and x_c are integrated, not the e
 """
 
 import functools
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -77,19 +78,23 @@ def exceeded(
     level, rate, floor = (float(v.mid()) for v in (rule.level, rule.rate, rule.floor))
     x, noise = floats(loop.start)[:, 0], floats(loop.noise)
     kind_of_noise = rng.choice(["random", "hides", "provokes"])
-    correction = np.zeros((n, n)) if loop.observer is None else floats(loop.observer.correction)
+    gains = [] if loop.observer is None else [floats(gain) for gain in loop.observer.gains]
+    C, tests = np.eye(n) if loop.observer is None else floats(loop.observer.outputs), count()
 
     def measured(x: Array, x_s: Array, x_hat: Array) -> Array:
         """Return a measurement with the largest noise: in random directions, or against or for an event.
 
         An observer's estimate takes its place.
         """
-        x = x + correction @ (x_hat - x)
+        added = noise
+        if gains:
+            L = gains[min(next(tests), len(gains) - 1)]
+            x, added = x + (np.eye(n) - L @ C) @ (x_hat - x), L @ noise
         signs = rng.choice([-1.0, 1.0], noise.shape[1])
         if kind_of_noise != "random":
-            along = (W @ noise).T @ (W @ (x_s - x))
+            along = (W @ added).T @ (W @ (x_s - x))
             signs = np.where(along == 0, signs, np.sign(along)) * (1 if kind_of_noise == "hides" else -1)
-        return np.asarray(x + noise @ signs)
+        return np.asarray(x + added @ signs)
 
     remembered = _Memory(loop)
     y = measured(x, x, x if loop.observer is None else x + floats(loop.observer.start)[:, 0])

@@ -27,10 +27,9 @@ def test_a_key_of_a_rule_within_a_rule_is_that_of_a_trigger() -> None:
 
 
 REFUSED = {
-    'observer={kind="kalman", process_std=[1, 1], noise_std=[1, 1], initial_std=[1, 1]}': "observer.kind",
+    "network.protocol=ack": "network.protocol",
     "controller.safe_input=[1.0]": "controller.safe_input",
     "controller.update_timeout_s=1.0": "controller.update_timeout_s",
-    "network.protocol=ack": "network.protocol",
     'network.impairments=[{kind="rate", rate_bps=1000000}]': "certificate.network_delay_s",
 }
 

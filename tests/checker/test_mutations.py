@@ -241,7 +241,10 @@ def _of_observer(field: str, factor: float) -> Callable[[Loop, Rng], Loop]:
         if loop.observer is None:
             return loop
         value = getattr(loop.observer, field)
-        scaled = value * factor if field == "period" else value * number(factor)
+        if field == "gains":
+            scaled = tuple(gain * number(factor) for gain in value)
+        else:
+            scaled = value * factor if field == "period" else value * number(factor)
         times = loop.times
         if field == "period":
             times = times._replace(sampling=scaled, least_sampling=scaled)
@@ -268,7 +271,7 @@ LOOPS: dict[str, Callable[[Loop, Rng], Loop]] = {
     "start of the other sign": lambda loop, rng: loop._replace(start=loop.start * -1),
     "another push": _one_of("pushes"),
     "larger disturbance": lambda loop, rng: loop._replace(sizes=tuple(s * number(1.1) for s in loop.sizes)),
-    "another observer": _of_observer("correction", 0.98),
+    "another observer": _of_observer("gains", 0.98),
     "another estimate": _of_observer("start", 1.02),
     "a much worse estimate": _of_observer("start", 20.0),
     "tests of the observer half as often": _of_observer("period", 2),

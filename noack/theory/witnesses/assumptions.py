@@ -176,17 +176,17 @@ def smooth_part(loop: Loop) -> dict[str, object] | None:
     S spans what F does not bring to 0 at once, and Se^{ΛT} = FS.
     """
     observer, n = loop.observer, loop.n
-    if observer is None or not floats(observer.start).any():
+    if observer is None or len(observer.gains) > 2 or not floats(observer.start).any():
         return None
     period_s = float(observer.period.p) / float(observer.period.q)
-    F = floats(observer.correction) @ expm(floats(loop.A) * period_s)
+    F = floats(observer.last_correction) @ expm(floats(loop.A) * period_s)
     least = _AT_ONCE if loop.loads else 0.0
     triangle, basis, q = schur(F, sort=lambda re, im: np.hypot(re, im) > least)
     step, S = triangle[:q, :q], basis[:, :q]
     values = np.linalg.eigvals(step)
     if not q or (np.abs(values) < _FASTEST).any() or (np.abs(np.angle(values)) > _MOST_TURN).any():
         return None
-    first = floats(observer.first_correction) @ floats(observer.start)
+    first = floats(observer.correction(0)) @ floats(observer.start)
     if q == n:
         S, step = np.eye(n), F
     else:  # after n steps nothing else is left
@@ -200,7 +200,7 @@ def observer_decay(loop: Loop) -> float:
     if loop.observer is None:
         return np.inf
     period_s = float(loop.observer.period.p) / float(loop.observer.period.q)
-    F = floats(loop.observer.correction) @ expm(floats(loop.A) * period_s)
+    F = floats(loop.observer.last_correction) @ expm(floats(loop.A) * period_s)
     return float(-np.log(np.abs(np.linalg.eigvals(F)).max()) / period_s)
 
 
