@@ -344,10 +344,10 @@ class RecordedRun:
 
     @cached_property
     def loops_at_once(self) -> int:
-        """How many loops are read together: a power of 2, as in the row groups of early tables."""
+        """How many loops are read together."""
         timing = self.scenario.timing
         steps = max(timing.horizon_ns // timing.plant_period_ns, 1)
-        return int(2 ** (min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // steps, 1)).bit_length() - 1))
+        return min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // steps, 1))
 
     def record(self, number: int) -> RunRecord:
         """Return the record of the loop of a number; it stays in memory until another is used."""

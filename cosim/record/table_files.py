@@ -8,7 +8,6 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,8 +22,6 @@ from noack.core.file_access import new_file
 from noack.protocol.record_tables import LOOP, OWNER, entry_names
 from noack.protocol.wire_format import MAX_LOOPS
 
-_MOST_GROUP_ROWS = 2 * BATCH_ROWS
-"""Largest number of rows of a group that is read: that of earlier versions."""
 _LEAST_GROUP_ROWS = 3 * BATCH_ROWS // 4
 _ROWS_IN_CACHE = 2048
 """Rows that stay in the processor's cache while they are filled column by column."""
@@ -76,9 +73,9 @@ class TableFile:
                 raise CallerError(
                     f"{path}: has {self.rows:,} rows; a run of this scenario has at most {most_rows:,}"
                 )
-            if (largest := max((group.num_rows for group in groups), default=0)) > _MOST_GROUP_ROWS:
+            if (largest := max((group.num_rows for group in groups), default=0)) > BATCH_ROWS:
                 raise CallerError(
-                    f"{path}: has {largest:,} rows in one part; at most {_MOST_GROUP_ROWS:,} are read"
+                    f"{path}: has {largest:,} rows in one part; at most {BATCH_ROWS:,} are read"
                 )
             names = metadata.schema.names
             loop_column = names.index(LOOP) if LOOP in names else None
@@ -106,18 +103,13 @@ class TableFile:
                             yield number, rows
 
     def whole(self) -> pa.Table:
-        """Return the table, loop after loop, with all columns of the file."""
+        """Return the table with all columns of the file."""
         with self._open() as file:
             table = file.read()
             table.validate(full=True)
         for column, _ in _columns(self._dtype):
             _require_no_nulls(self._path, column, table.column(column))
-        in_turn = all(group.last <= after.first for group, after in pairwise(self.groups))
-        if in_turn or LOOP not in table.column_names:
-            return table
-        table = table.combine_chunks()
-        numbers = _values(self._path, LOOP, table[LOOP], self._dtype[LOOP])
-        return table.take(_array(np.argsort(numbers, kind="stable")))
+        return table
 
     def segments(self) -> Iterator[Segment]:
         """Yield the groups as segments."""

@@ -34,7 +34,6 @@ def real_number(
     value: object,
     *,
     above: float | None = None,
-    least: float | None = None,
     most: float | None = None,
 ) -> float:
     """Return a number, also one of NumPy, as :func:`whole_number` does; it must be more than ``above``."""
@@ -43,7 +42,7 @@ def real_number(
     number = float(value)
     if above is not None and not number > above:
         raise _wrong(name, value, f"more than {above:g}")
-    _require_range(name, value, number, least, most)
+    _require_range(name, value, number, None, most)
     return number
 
 

@@ -250,17 +250,15 @@ class Claim(SummaryPart):
     """The claim ends here, at the first change of a setting on which it depends; None: at the end of
     the run."""
     proved: bool | None = None
-    """Whether the checker has proven the bound of a certificate; runs of earlier versions have computed
-    ones. None: it follows from the definitions of the loop, or there is no bound."""
+    """Whether the checker has proven the bound, as that of a certificate. None: it follows from the
+    definitions of the loop, or there is no bound."""
     output: Text | None = None
     """The output that is bounded, by its name; None: something else is."""
 
     @property
     def origin(self) -> str:
         """The source, and how the bound is known."""
-        if self.proved is None:
-            return self.source
-        return f"{self.source} ({'proved' if self.proved else 'computed'})"
+        return f"{self.source} (proved)" if self.proved else self.source
 
     @property
     def is_certified(self) -> bool:

@@ -106,7 +106,7 @@ def test_a_table_is_a_regular_file_in_parts_of_bounded_length(run_dir: Path) -> 
     path = run_dir / RECORD / f"{PLANT_STEP}.parquet"
     table = pq.read_table(path)
     pq.write_table(pa.concat_tables([table] * (40_000 // len(table))), path, row_group_size=10**6)
-    with pytest.raises(CallerError, match=r"rows in one part; at most 32,768 are read"):
+    with pytest.raises(CallerError, match=r"rows in one part; at most 16,384 are read"):
         load_record(run_dir)
     path.unlink()
     os.mkfifo(path)
