@@ -63,6 +63,7 @@ they do not: see :mod:`.proof`.
 """
 
 from collections.abc import Container, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
@@ -94,6 +95,8 @@ class Unit(NamedTuple):
     has_constants: bool
     threshold: arb
     noise: arb
+    of_constant: arb = arb(1)
+    """What a constant 1 is in this unit, if it has constants."""
 
 
 class Comparison(NamedTuple):
@@ -114,9 +117,8 @@ class Witness(NamedTuple):
 
 
 class Source(NamedTuple):
-    """A column through which something acts, and the sup of its amplitude in the equation of x and of e_s."""
+    """What acts through a column: the sup of its amplitude in the equation of x and of e_s."""
 
-    column: arb_mat
     of_state: Form
     of_error: Form
     early: Form  # in both, beside these, up to the first input
@@ -132,6 +134,20 @@ def units_of(loop: Loop, rate: arb) -> list[Unit]:
     if loop.needs_constant:
         found.append(Unit(arb(0), not has_decaying, True, floor, constant))
     return found
+
+
+def single_unit(loop: Loop, rate: arb) -> Unit | None:
+    """Return the unit max(f₁, f/c) of a threshold max(c f₁, f), or f₂ if c is 0, of all that acts.
+
+    None: there is only one unit, or no constant threshold.
+    """
+    (level, floor), (decaying, constant) = thresholds(loop, rate), noise_of(loop, rate).sizes
+    if not (loop.has_decaying_unit(rate) and loop.needs_constant and floor > 0):
+        return None
+    if level > 0 and bool(rate == loop.rule.rate):
+        scale = level / floor
+        return Unit(rate, True, True, level, decaying + scale * constant, scale)
+    return Unit(arb(0), True, True, level.max(floor), decaying + constant)
 
 
 def read_witness(loop: Loop, table: Mapping[str, object]) -> Witness:
@@ -216,160 +232,194 @@ def _followed(loop: Loop, table: Mapping[str, object]) -> Loop:
     )
 
 
-class UnitGains:
-    """The inequalities in one unit, and their solution.
+class _Responses:
+    """What follows of x and of errors from what acts, at a rate, which two units may share.
 
     Args:
         loop: the loop.
-        unit: the unit.
+        rate: what is added to A + BK, H and A.
         witness: what the document names.
         wanted: the outputs to bound.
-        constant: the inequalities in the unit f₂, for those in f₁, if there are both.
 
     Raises:
-        RejectedError: a response is not enclosed, or a signal has no bound.
+        RejectedError: a response is not enclosed.
     """
 
-    def __init__(
-        self,
-        loop: Loop,
-        unit: Unit,
-        witness: Witness,
-        wanted: Container[str],
-        constant: "UnitGains | None" = None,
-    ) -> None:
-        self.loop, self.unit, self._constant = loop, unit, constant
+    def __init__(self, loop: Loop, rate: arb, witness: Witness, wanted: Container[str]) -> None:
+        self.loop, self.witness = loop, witness
         n, m, times, one = loop.n, loop.B.ncols(), loop.times, identity(loop.n)
-        compared = witness.comparison or Comparison(loop.weight, zeros(n, n), zeros(0, n))
+        self.compared = witness.comparison or Comparison(loop.weight, zeros(n, n), zeros(0, n))
         try:
-            self._inputs, inverse, of_compared = (
-                M.inv() for M in (witness.inputs, loop.weight, compared.errors)
+            self.inputs, self.inverse, of_compared = (
+                M.inv() for M in (witness.inputs, loop.weight, self.compared.errors)
             )
         except ZeroDivisionError:
             raise RejectedError("gains: weight, inputs or errors: not proven to have an inverse") from None
-        K, H, self._closed = witness.inputs * loop.gain, loop.H, loop.A + loop.B * loop.gain
-        self._early, is_periodic = arb(times.start), times.period > 0
-        self._untested = arb(times.period if is_periodic else max(times.sampling, times.dwell))
-        self._lost = 0 if is_periodic else loop.losses
-        recent = self._untested * (1 + loop.losses if is_periodic else 1) + arb(times.delay)
+        self.gain, H, closed = witness.inputs * loop.gain, loop.H, loop.A + loop.B * loop.gain
+        K, is_periodic = self.gain, times.period > 0
+        self.untested = arb(times.period if is_periodic else max(times.sampling, times.dwell))
+        self.lost = 0 if is_periodic else loop.losses
+        recent = self.untested * (1 + loop.losses if is_periodic else 1) + arb(times.delay)
         halves = zip(loop.half_A.tolist(), loop.half_B.tolist(), strict=True)
-        self._boxed = [i for i, rows in enumerate(halves) if any(entry != 0 for row in rows for entry in row)]
-        mismatch = self._closed - H
-        self._mismatched = [i for i in range(n) if not is_zero(rows_of(mismatch, [i]))]
-        self._sources = list(self._all_sources())
+        self.boxed = [i for i, rows in enumerate(halves) if any(entry != 0 for row in rows for entry in row)]
+        mismatch = closed - H
+        self.mismatched = [i for i in range(n) if not is_zero(rows_of(mismatch, [i]))]
+        self.driving, first = self._driving(), m + len(self.boxed)
+        self.of_mismatch = range(first, first + len(self.mismatched))
 
         # The state.
-        aged = K * (-1 * upto(arb(times.age)) * H).exp()
-        share, shift = compared.share, loop.weight * compared.shift
+        self.aged = K * (-1 * upto(arb(times.age)) * H).exp()
+        share, shift = self.compared.share, loop.weight * self.compared.shift
         entries = {f"x[{i}]": rows_of(one, [i]) for i in range(n)}
         entries |= {f"y[{i}]": rows_of(loop.output_rows, [i]) for i in range(loop.output_rows.nrows())}
         outputs = {"x": one, "share": share, "shift": shift}
         outputs |= {
-            name: row for name, row in entries.items() if name in wanted or (self._boxed and name[0] == "x")
+            name: row for name, row in entries.items() if name in wanted or (self.boxed and name[0] == "x")
         }
         outputs |= {f"Kx {j}": rows_of(loop.gain, [j]) for j in range(m)}
-        outputs |= {f"Ex {i}": rows_of(mismatch, [i]) for i in self._mismatched}
+        outputs |= {f"Ex {i}": rows_of(mismatch, [i]) for i in self.mismatched}
+        outputs |= {"WEx": loop.weight * mismatch} if self.mismatched else {}
         if times.age > 0:
             outputs |= {f"aged {j}": rows_of(K, [j]) * H for j in range(m)}
-            outputs |= {f"bent {j}": rows_of(aged, [j]) * H * H for j in range(m)}
-        columns = [source.column for source in self._sources] + [loop.start] * unit.has_start
-        found = responses(self._closed + unit.rate * one, witness.plant, list(outputs.values()), columns)
-        self._states = dict(zip(outputs, found, strict=True))
-        open_loop, rows = loop.A + unit.rate * one, [rows_of(K, [j]) for j in range(m)]
-        self._before = responses_until(open_loop, self._early, rows, columns)
+            outputs |= {f"bent {j}": rows_of(self.aged, [j]) * H * H for j in range(m)}
+        columns = [*self.driving, loop.start]
+        found = responses(closed + rate * one, witness.plant, list(outputs.values()), columns)
+        self.states = dict(zip(outputs, found, strict=True))
+        self.before = responses_until(
+            loop.A + rate * one, arb(times.start), [rows_of(K, [j]) for j in range(m)], columns
+        )
 
         # Errors.
-        self._scaled_H = H + unit.rate * one
-        errors = {"W": loop.weight} | {f"p {j}": rows_of(aged, [j]) for j in range(m)}
+        self.scaled_H = H + rate * one
+        errors = {"W": loop.weight} | {f"p {j}": rows_of(self.aged, [j]) for j in range(m)}
+        self.is_own = is_zero(self.compared.errors - loop.weight)
+        self.columns = [self.inverse]
+        if witness.comparison is not None and not self.is_own:
+            self.columns.append(of_compared)
+        self.starts = len(self.columns)
+        self.columns += self.driving
+        found = responses_until(self.scaled_H, recent, list(errors.values()), self.columns)
+        self.recent = dict(zip(errors, found, strict=True))
+        self.untested_growth = self.growth(self.untested)
+        self.ever = {}
+        if self.lost:
+            self.ever = dict(zip(errors, self._for_ever(list(errors.values())), strict=True))
+
+    def _driving(self) -> list[arb_mat]:
+        """Return the columns through which something acts, in the order of :meth:`UnitGains.sources`."""
+        loop, one = self.loop, identity(self.loop.n)
+        B = loop.B * self.inputs
+        found = [columns_of(B, [j]) for j in range(B.ncols())]
+        found += [columns_of(one, [i]) for i in (*self.boxed, *self.mismatched)]
+        found += [columns_of(loop.pushes, [i]) for i in range(loop.pushes.ncols())]
+        return found if loop.push_before_input is None else [*found, loop.push_before_input]
+
+    def growth(self, until: arb) -> list[Response]:
+        """Return the growth of W e_s within a time, from W⁻¹ and by each source."""
+        return responses_until(self.scaled_H, until, [self.loop.weight], self.columns)[0]
+
+    def _for_ever(self, outputs: Sequence[arb_mat]) -> list[list[Response]]:
+        if is_zero(self.scaled_H):
+            return [[Response(norm_of(C * Y), arb(0)) for Y in self.columns] for C in outputs]
+        if self.witness.model is None:
+            raise RejectedError("gains: model: missing")
+        return responses(self.scaled_H, self.witness.model, outputs, self.columns)
+
+
+class UnitGains:
+    """The inequalities in one unit, and their solution.
+
+    Args:
+        responses: what follows from what acts, at the rate of the unit.
+        unit: the unit.
+        constant: the inequalities in the unit f₂, for those in f₁, if there are both.
+
+    Raises:
+        RejectedError: a signal has no bound.
+    """
+
+    def __init__(self, responses: _Responses, unit: Unit, constant: "UnitGains | None" = None) -> None:
+        self.loop, self.unit, self._constant, self.responses = responses.loop, unit, constant, responses
+        self._early, self.sources = arb(self.loop.times.start), list(self._all_sources())
         self._tested: list[dict[str, arb]] = [{"1": unit.noise}]
         """The parts of e_s after a test: of W⁻¹, and perhaps of Y⁻¹."""
-        starts, is_own = [inverse], is_zero(compared.errors - loop.weight)
-        if witness.comparison is not None:
+        compared = responses.compared
+        if responses.witness.comparison is not None:
             self._tested[0] |= {"shift": arb(1)}
-            if is_own:
+            if responses.is_own:
                 self._tested[0] |= {"compared": arb(1)}
             else:
                 self._tested.append({"compared": arb(1)})
-                starts.append(of_compared)
-        self._columns = [*starts, *(source.column for source in self._sources)]
-        found = responses_until(self._scaled_H, recent, list(errors.values()), self._columns)
-        self._recent = dict(zip(errors, found, strict=True))
-        self._untested_growth = self.growth(self._untested)
-        self._ever = {}
-        if self._lost:
-            self._ever = dict(zip(errors, self._for_ever(list(errors.values()), witness.model), strict=True))
-        self._of_noise = {
-            name: norm_of(M * inverse) * unit.noise for name, M in (("share", share), ("shift", shift))
-        }
+        parts = (("share", compared.share), ("shift", self.loop.weight * compared.shift))
+        self._of_noise = {name: norm_of(M * responses.inverse) * unit.noise for name, M in parts}
         self.sups = self._solution()
 
     def _all_sources(self) -> Iterator[Source]:
         loop, unit, one = self.loop, self.unit, arb(1)
-        n, B = loop.n, loop.B * self._inputs
-        for j in range(B.ncols()):
+        for j in range(loop.B.ncols()):
             amplitude = {f"p {j}": one}
-            yield Source(columns_of(B, [j]), amplitude, amplitude, {f"p more {j}": one})
-        for i in self._boxed:
+            yield Source(amplitude, amplitude, {f"p more {j}": one})
+        for i in self.responses.boxed:
             amplitude = {f"box {i}": one}
-            yield Source(columns_of(identity(n), [i]), amplitude, amplitude, {}, is_outside=True)
-        for i in self._mismatched:
-            yield Source(columns_of(identity(n), [i]), {}, {f"Ex {i}": one}, {})
-        if unit.has_constants:
-            for i, size in enumerate(loop.sizes):
-                yield Source(columns_of(loop.pushes, [i]), {"1": size}, {"1": size}, {}, is_outside=True)
-        if loop.push_before_input is not None and unit.has_start:  # it acts up to t_a, where f₁ has fallen
-            early = {"1": (arb(loop.times.start) * unit.rate).exp()}
-            yield Source(loop.push_before_input, {}, {}, early, is_outside=True)
-
-    def growth(self, until: arb) -> list[Response]:
-        """Return the growth of W e_s within a time, from W⁻¹ and by each source."""
-        return responses_until(self._scaled_H, until, [self.loop.weight], self._columns)[0]
-
-    def _for_ever(self, outputs: Sequence[arb_mat], decay: Decay | None) -> list[list[Response]]:
-        if is_zero(self._scaled_H):
-            return [[Response(norm_of(C * Y), arb(0)) for Y in self._columns] for C in outputs]
-        if decay is None:
-            raise RejectedError("gains: model: missing")
-        return responses(self._scaled_H, decay, outputs, self._columns)
+            yield Source(amplitude, amplitude, {}, is_outside=True)
+        for i in self.responses.mismatched:
+            yield Source({}, {f"Ex {i}": one}, {})
+        for size in loop.sizes:
+            amplitude = {"1": size * unit.of_constant} if unit.has_constants else {}
+            yield Source(amplitude, amplitude, {}, is_outside=True)
+        if loop.push_before_input is not None:  # it acts up to t_a, where f₁ has fallen
+            early = {"1": (arb(loop.times.start) * unit.rate).exp()} if unit.has_start else {}
+            yield Source({}, {}, early, is_outside=True)
 
     def state(self, name: str) -> Form:
         """Return the bound of an output |Cx|."""
-        found = self._states[name]
+        found = self.responses.states[name]
         terms: list[tuple[arb, Form]] = []
         if self.unit.has_start:
             terms.append((found[-1].most, {"1": arb(1)}))
-        for response, source in zip(found, self._sources, strict=False):
+        for response, source in zip(found, self.sources, strict=False):
             terms.append((response.total, source.of_state))
             terms.append((response.total.min(self._early * response.most), source.early))
         return _sum(*terms)
 
     def input(self, j: int) -> Form:
         """Return the bound of an input |u_j|; it is 0 before the first one."""
-        terms = [(abs(self._inputs[j, k]), {f"p {k}": arb(1)}) for k in range(self._inputs.ncols())]
+        terms = [
+            (abs(self.responses.inputs[j, k]), {f"p {k}": arb(1)})
+            for k in range(self.responses.inputs.ncols())
+        ]
         return _sum((arb(1), self.state(f"Kx {j}")), *terms)
 
     def sensor_error(self) -> Form:
         """Return the bound of ‖W e_s‖."""
-        grown = self._untested_growth
+        grown = self.responses.untested_growth
         return _sum(*self._after_test(grown), *self.driven(self.of_sources(grown)))
 
     def error(self, name: str) -> Form:
         """Return the bound of an output |C e_c|: "W", or "p j" for the row j of K e^{−Hs}."""
-        recent = self._recent[name]
+        recent = self.responses.recent[name]
         terms, sources = self._after_test(recent), self.of_sources(recent)
-        if self._lost:
-            ever, gain = self._ever[name], self._ever[name][0].most
-            terms += [(self._lost * most, form) for most, form in self._after_test(ever)]
-            terms.append((self._lost * gain, {"1": self.unit.noise}))
-            growths = zip(sources, self.of_sources(ever), self.of_sources(self._untested_growth), strict=True)
-            sources = [
-                Response(
-                    of_ever.most,
-                    of_recent.total + self._lost * (self._untested * of_ever.most).min(gain * untested.total),
-                )
-                for of_recent, of_ever, untested in growths
-            ]
+        if self.responses.lost:
+            of_lost, further = self._lost(name)
+            terms += of_lost
+            sources = [Response(b.most, a.total + b.total) for a, b in zip(sources, further, strict=True)]
         return _sum(*terms, *self.driven(sources))
+
+    def lost(self, name: str) -> Form:
+        """Return the bound of what the events that are lost add to an output |C e_c|."""
+        if not self.responses.lost:
+            return {}
+        terms, sources = self._lost(name)
+        return _sum(*terms, *self.driven(sources))
+
+    def _lost(self, name: str) -> tuple[list[tuple[arb, Form]], list[Response]]:
+        """Return terms of the bound of what lost events add, and the responses to the sources."""
+        lost, ever, untested = self.responses.lost, self.responses.ever[name], self.responses.untested
+        gain = ever[0].most
+        terms = [(lost * most, form) for most, form in self._after_test(ever)]
+        terms.append((lost * gain, {"1": self.unit.noise}))
+        growths = zip(self.of_sources(ever), self.of_sources(self.responses.untested_growth), strict=True)
+        return terms, [Response(a.most, lost * (untested * a.most).min(gain * b.total)) for a, b in growths]
 
     def _after_test(self, growths: Sequence[Response]) -> list[tuple[arb, Form]]:
         """Return terms of an error, by what a test leaves."""
@@ -381,9 +431,20 @@ class UnitGains:
 
     def driven(self, growths: Sequence[Response]) -> Iterator[tuple[arb, Form]]:
         """Yield terms of an error, by what it is driven by each source."""
-        for growth, source in zip(growths, self._sources, strict=True):
+        for growth, source in zip(growths, self.sources, strict=True):
             yield growth.total, source.of_error
             yield growth.total.min(self._early * growth.most), source.early
+
+    def by_age(self, j: int) -> Form:
+        """Return the bound of what the age of the input adds to p_j, of x."""
+        age = arb(self.loop.times.age)
+        if age == 0:
+            return {}
+        return _sum((age, self.state(f"aged {j}")), (age**2 / 2, self.state(f"bent {j}")))
+
+    def value(self, form: Form) -> arb:
+        """Return the value of a form of the solution, rounded up."""
+        return value(form, self.sups)
 
     def _inequalities(self, slope: arb) -> Iterator[tuple[str, Form]]:
         """Yield signals and what they are at most; of a signal with several, the largest.
@@ -392,23 +453,20 @@ class UnitGains:
         """
         loop, one = self.loop, arb(1)
         for j in range(loop.B.ncols()):
-            age, aged = arb(loop.times.age), list[tuple[arb, Form]]()
-            if loop.times.age > 0:
-                aged = [(age, self.state(f"aged {j}")), (age**2 / 2, self.state(f"bent {j}"))]
-            yield f"p {j}", _sum((one, self.error(f"p {j}")), *aged)
-            before = self._before[j]
-            pairs = list(zip(before, self._sources, strict=False))
+            yield f"p {j}", _sum((one, self.error(f"p {j}")), (one, self.by_age(j)))
+            before = self.responses.before[j]
+            pairs = list(zip(before, self.sources, strict=False))
             outside = [(response.total, source) for response, source in pairs if source.is_outside]
             terms = [(total, form) for total, source in outside for form in (source.of_error, source.early)]
             terms += [(before[-1].most, {"1": one})] if self.unit.has_start else []
             yield f"p before {j}", _sum(*terms)
             yield f"p more {j}", {}
             yield f"p more {j}", {f"p before {j}": one, f"p {j}": -one}
-        for i in self._boxed:
+        for i in self.responses.boxed:
             terms = [(loop.half_A[i, j], self.state(f"x[{j}]")) for j in range(loop.n)]
             terms += [(loop.half_B[i, j], self.input(j)) for j in range(loop.B.ncols())]
             yield f"box {i}", _sum(*terms)
-        for i in self._mismatched:
+        for i in self.responses.mismatched:
             yield f"Ex {i}", self.state(f"Ex {i}")
         for name, of_noise in self._of_noise.items():
             yield name, _sum((one, self.state(name)), (of_noise, {"1": one}))
@@ -502,7 +560,8 @@ class Gains:
     def __init__(self, loop: Loop, rate: arb, table: Mapping[str, object]) -> None:
         loop = _followed(loop, table)
         require_covered(loop)
-        self.loop, self.rate, witness = loop, rate, read_witness(loop, table)
+        witness = read_witness(loop, table)
+        self.loop, self.rate, self._witness = loop, rate, witness
         witness.plant.require(loop.A + loop.B * loop.gain + rate * identity(loop.n), "gains: plant")
         if witness.model is not None:
             witness.model.require(loop.H + rate * identity(loop.n), "gains: model")
@@ -511,15 +570,17 @@ class Gains:
         outputs = table.get("outputs")
         if not isinstance(outputs, list) or not {"x", "e_s", "e_c"} | entries >= {*map(str, outputs)}:
             raise RejectedError("gains: outputs: not a list of the loop's")
-        self._units: list[UnitGains] = []
+        self._outputs = [*map(str, outputs)]
+        self._responses: dict[bool, _Responses] = {}
+        self.units: list[UnitGains] = []
         for unit in reversed(units_of(loop, rate)):
-            self._units.append(UnitGains(loop, unit, witness, outputs, *self._units))
-        self.bounds = {str(output): self._bound(str(output)) for output in outputs}
+            self.units.append(self._gains(unit, *self.units))
+        self.bounds = {output: self._bound(output) for output in self._outputs}
         """D₁ and D₂ of each output that the document names."""
 
     def _bound(self, output: str) -> tuple[arb, arb]:
         found = {True: arb(0), False: arb(0)}
-        for gains in self._units:
+        for gains in self.units:
             index = int(output[2:-1]) if output.endswith("]") else 0
             if output == "e_s":
                 form = gains.sensor_error()
@@ -530,11 +591,17 @@ class Gains:
             found[gains.unit.has_constants] = value(form, gains.sups)
         return found[False], found[True]
 
-    def reached(self, time: arb) -> tuple[arb, arb]:
-        """Return bounds of ‖W (e_s − n)‖ in both units, n of a test up to a time after an event."""
-        found = {True: arb(0), False: arb(0)}
-        for gains in self._units:
-            grown = gains.growth(time)
-            form = _sum(*gains.driven(gains.of_sources(grown)))
-            found[gains.unit.has_constants] = value(form, gains.sups) + (grown[0].most + 1) * gains.unit.noise
-        return found[False], found[True]
+    def _gains(self, unit: Unit, *constant: UnitGains) -> UnitGains:
+        key = bool(unit.rate > 0)
+        if key not in self._responses:
+            self._responses[key] = _Responses(self.loop, unit.rate, self._witness, self._outputs)
+        return UnitGains(self._responses[key], unit, *constant)
+
+    @cached_property
+    def single(self) -> UnitGains | None:
+        """The inequalities in one unit instead of two, as :mod:`.apart` needs them; None: there are none."""
+        unit = single_unit(self.loop, self.rate)
+        try:
+            return None if unit is None else self._gains(unit)
+        except RejectedError:
+            return None

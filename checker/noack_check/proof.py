@@ -5,7 +5,8 @@ each output the numbers that :mod:`.check` verifies. From the bound of the drift
 
 * the sensor's error between two tests: e^{Hs} times its value at the test, plus what the drift adds;
 * the least time between events, since e_s begins at the noise n of the event's measurement and has to
-  reach the threshold, to within the noise of another one.
+  reach the threshold, to within the noise of another one. It comes at a test: with k tests that are silent
+  it is the next one, k + 1 least times between two tests later.
 
 Rules that do not compare ‖W e_s‖ with a threshold have a bound of e_s by quadratic forms, and their
 events are as far apart as tests. From a bound of e_s follows
@@ -24,6 +25,7 @@ from typing import Any, NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
+from noack_check.apart import share_of_threshold
 from noack_check.balls import around_zero, frobenius, identity, is_zero, rows_of, upto
 from noack_check.check import RejectedError, verify
 from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
@@ -36,7 +38,6 @@ from noack_check.norms import decays_below, growth, spectral_norm
 MOST_PIECES = 64
 MOST_LATER = 8
 """Most events within the time that an update may be on its way."""
-_MOST_TESTS = 1_000_000
 _CELLS = 32
 """Parts of the time before the first input."""
 _MOST_TRIES, _WIDER = 20, arb(1.1)
@@ -60,9 +61,9 @@ class Proof(NamedTuple):
 
     rate: arb  # r, 1/s
     bounds: tuple[Bound, ...]
-    inter_event: arb | None
+    inter_event: fmpq | None
     """Two events after the one at t = 0 are at least this far apart, s; None: nothing is known."""
-    first_event: arb | None
+    first_event: fmpq | None
     """No event follows the one at t = 0 before this time, s."""
     is_quiet: bool
     """No event follows the one at t = 0 before the first input acts; else the other times hold from it on."""
@@ -109,8 +110,7 @@ def conclude(
     else:
         is_quiet = _is_quiet(loop, by_gains)
     if by_gains is not None:
-        apart = by_gains if apart is None else apart.max(by_gains)
-        first = by_gains if first is None else first.max(by_gains)
+        apart, first = (max(time or by_gains, by_gains) for time in (apart, first))
     if assumed.errors is not None:
         _require_errors(loop, rate, proven, assumed.errors)
     if loop.region is not None:
@@ -131,6 +131,7 @@ def conclude(
     is_moved = loop.loads > 0 or loop.until is not None or loop.push_before_input is not None
     if is_moved and any(bound.output.startswith("u[") for bound in bounds):
         raise RejectedError("u: about a reference, or where the loop rests, the input is not an output")
+    apart, first = (_at_tests(loop.times, time) for time in (apart, first))
     return Proof(rate, tuple(_about(loop, bound) for bound in bounds), apart, first, is_quiet)
 
 
@@ -145,25 +146,23 @@ def _about(loop: Loop, bound: Bound) -> Bound:
     return bound._replace(constant=bound.constant + loop.offset * spectral_norm(row))
 
 
-def _apart_by_gains(loop: Loop, gains: Gains, table: Mapping[str, object]) -> arb | None:
+def _apart_by_gains(loop: Loop, gains: Gains, table: Mapping[str, object]) -> fmpq | None:
     """Return a least time between any two events, as proven; None: the document states none.
 
-    With v = e^{−rt}, ‖W (e_s − n)‖ reaches at most a v + b, and the threshold is max(c v, f): see
-    :func:`_prove_inter_event`. The rule is that of the loop: one for which it is taken has other events.
+    The rule is that of the loop: one for which it is taken has other events.
     """
     if "inter_event_s" not in table:
         return None
-    apart = read_number(table, "inter_event_s")
+    apart = _time(table, "inter_event_s")
     _require_silent(loop, apart)
-    decaying, constant = gains.reached(apart)
-    if apart > 0:
-        _require_below(loop, gains.rate, lambda v: decaying * v + constant, is_decaying=constant == 0)
+    if apart > 0 and not share_of_threshold(gains, arb(apart)) < 1:
+        raise RejectedError("inter_event_s: an event may come earlier")
     return apart
 
 
-def _is_quiet(loop: Loop, apart: arb | None) -> bool:
+def _is_quiet(loop: Loop, apart: fmpq | None) -> bool:
     """Return whether it is proven that no event follows the one at t = 0 before the first input acts."""
-    if apart is not None and apart >= arb(loop.times.start):
+    if apart is not None and apart >= loop.times.start:
         return True
     try:
         return require_few_at_start(loop, Assumptions(None, 0, 0, None))
@@ -250,7 +249,7 @@ def require_few_at_start(loop: Loop, assumed: Assumptions) -> bool:
     return assumed.later_at_start == 0
 
 
-def require_few_later(loop: Loop, assumed: Assumptions, apart: arb | None) -> None:
+def require_few_later(loop: Loop, assumed: Assumptions, apart: fmpq | None) -> None:
     """Prove that no more events than assumed happen while an update is on its way.
 
     Tests are the only times of events. If e_s needs longer than ``apart`` to reach the threshold, as
@@ -259,23 +258,38 @@ def require_few_later(loop: Loop, assumed: Assumptions, apart: arb | None) -> No
     """
     times, silent = loop.times, 0
     if apart is not None:
-        if apart * (assumed.later + 1) >= arb(times.delay):
+        if apart * (assumed.later + 1) >= times.delay:
             return
-        while times.sampling > 0 and silent < _MOST_TESTS and arb((silent + 1) * times.sampling) <= apart:
-            silent += 1
+        silent = _silent_tests(times, apart)
     if not (silent + 1) * times.least_apart * (assumed.later + 1) >= times.delay:
         raise RejectedError("later: more events may happen while an update is on its way")
 
 
+def _silent_tests(times: Times, apart: fmpq) -> int:
+    """Return how many tests after an event come within a time in which none is an event."""
+    return int((apart / times.sampling).floor()) if times.sampling > 0 else 0
+
+
+def _at_tests(times: Times, apart: fmpq | None) -> fmpq | None:
+    """Return how far events are apart at least, if none comes within a time after another: it is a test's.
+
+    None: nothing is known.
+    """
+    if not times.least_apart > 0:
+        return apart
+    apart = apart or fmpq(0)
+    return max(apart, times.least_apart, (_silent_tests(times, apart) + 1) * times.least_sampling)
+
+
 def _times_between_events(
     loop: Loop, rate: arb, drift: Bound, assumed: Assumptions, document: Mapping[str, object]
-) -> tuple[arb, arb]:
+) -> tuple[fmpq, fmpq]:
     """Return least times between two events, and of the first event after t = 0, as proven."""
-    apart = first = read_number(document, "inter_event_s")
+    apart = first = _time(document, "inter_event_s")
     _prove_inter_event(loop, rate, drift, apart)
     if loop.times.start > 0:
-        first = read_number(document, "first_event_s") if "first_event_s" in document else arb(0)
-        prove_first_event(loop, drift, first, loop.times.start)
+        first = _time(document, "first_event_s") if "first_event_s" in document else fmpq(0)
+        prove_first_event(loop, drift, arb(first), loop.times.start)
     return apart, first
 
 
@@ -422,7 +436,7 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
     return Bound(output, decaying, constant, starts)
 
 
-def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
+def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: fmpq) -> None:
     """Prove that e_s − n stays below the threshold for ``apart`` after an event, or that this is 0.
 
     With v = e^{−rt}, ‖W (e_s − n)‖ ≤ (D₁² v² + D₂²)^½ I + (g + 1) (n₁ v + n₂), where g and I are the supremum
@@ -432,7 +446,7 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
     _require_silent(loop, apart)
     if apart == 0:
         return
-    largest, total = growth(weighted(loop, rate), apart)
+    largest, total = growth(weighted(loop, rate), arb(apart))
     noise = [(largest + 1) * size for size in noise_of(loop, rate).sizes]
 
     def reached(v: arb) -> arb:
@@ -442,7 +456,7 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
     _require_below(loop, rate, reached, is_decaying=drift.constant == 0 and noise[1] == 0)
 
 
-def _require_silent(loop: Loop, apart: arb) -> None:
+def _require_silent(loop: Loop, apart: fmpq) -> None:
     """Require that events need the comparison of ‖W e_s‖, if a time between them is stated."""
     if apart != 0 and (loop.rule.always or not compares_error(loop) or not apart > 0):
         raise RejectedError("inter_event_s: not proven for this rule; 0 is")
@@ -583,6 +597,11 @@ def _share(parts: Sequence[tuple[arb, arb]], errors: Errors) -> arb:
 
 
 # Reading a document.
+
+
+def _time(table: Mapping[str, object], key: str) -> fmpq:
+    """Return a time in s, exactly."""
+    return read_number(table, key).fmpq()
 
 
 def _entries(document: Mapping[str, object], key: str) -> list[Mapping[str, object]]:

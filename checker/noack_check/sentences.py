@@ -2,8 +2,9 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+from fractions import Fraction
 
-from flint import arb
+from flint import arb, fmpq
 
 from noack_check.document import read_table
 from noack_check.equations import formulas
@@ -159,8 +160,10 @@ def at_most(value: arb) -> str:
     return _rounded(value.upper() if value.rad() != 0 else value, ROUND_CEILING)
 
 
-def at_least(value: arb) -> str:
+def at_least(value: arb | fmpq) -> str:
     """Return four digits of a number that is at most the value."""
+    if isinstance(value, fmpq):
+        return _rounded(value, ROUND_FLOOR)
     return _rounded(value.lower() if value.rad() != 0 else value, ROUND_FLOOR)
 
 
@@ -169,9 +172,10 @@ def _is_zero(value: arb) -> bool:
     return bool(value == 0)
 
 
-def _rounded(value: arb, rounding: str) -> str:
-    if value == arb(float(value)) and len(text := repr(float(value))) <= _SHORT:
+def _rounded(value: arb | fmpq, rounding: str) -> str:
+    exact, text = value if isinstance(value, fmpq) else value.mid().fmpq(), repr(float(value))
+    is_short = arb(float(value)).fmpq() == exact or Fraction(text) == Fraction(int(exact.p), int(exact.q))
+    if is_short and len(text) <= _SHORT:
         return text  # which stands for exactly this number
-    exact = value.mid().fmpq()
     context = Context(prec=4, rounding=rounding)
     return f"{context.divide(Decimal(int(exact.p)), Decimal(int(exact.q))):g}"

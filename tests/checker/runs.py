@@ -203,8 +203,8 @@ def _apart(found: list[Exceeded], proof: Proof, events: list[float], t: float, f
     least = proof.first_event if len(events) == 1 else proof.inter_event
     if not proof.is_quiet and events[-1] < first_input:
         least = None
-    if least is not None and t - events[-1] < float(least.mid()) - 1e-9:
-        found.append(Exceeded("inter-event time", t, t - events[-1], float(least.mid())))
+    if least is not None and t - events[-1] < float(least) - 1e-9:
+        found.append(Exceeded("inter-event time", t, t - events[-1], float(least)))
     events.append(t)
 
 

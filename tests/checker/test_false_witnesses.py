@@ -231,7 +231,7 @@ def test_the_threshold_at_the_first_input_is_one_constant_at_rate_0() -> None:
 
 
 def test_the_second_event_has_a_sentence_of_its_own() -> None:
-    apart, first = arb(0.25), arb(0.125)
+    apart, first = fmpq(1, 4), fmpq(1, 8)
     assert list(sentences(Proof(arb(1), (), apart, apart, True))) == ["two events are at least 0.25 s apart"]
     assert "0.125" in next(iter(sentences(Proof(arb(1), (), apart, first, True))))
     assert "after the first input" in next(iter(sentences(Proof(arb(1), (), apart, first, False))))
@@ -294,8 +294,8 @@ def test_later_events_by_tests_need_no_bound_of_the_drift() -> None:
     with pytest.raises(RejectedError, match="later"):
         require_few_later(loop, none._replace(later=1), None)
     require_few_later(loop, none._replace(later=2), None)
-    require_few_later(loop, none, arb(3) / 100 + arb(2) ** -60)
-    require_few_later(loop, none, arb(21) / 1000)  # two silent tests: the third is at 0.03 s
+    require_few_later(loop, none, fmpq(3, 100))
+    require_few_later(loop, none, fmpq(21, 1000))  # two silent tests: the third is at 0.03 s
 
 
 def test_the_start_has_as_many_events_as_tests() -> None:

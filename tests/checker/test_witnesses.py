@@ -66,7 +66,7 @@ def test_bounds_are_near_what_is_simulated(witness: Witness) -> None:
     assert 0.05 <= sizes["e_s"] < 0.06  # the threshold is 0.05
     assert sizes["e_s"] < sizes["e_c"] < 0.4
     assert witness.proof.inter_event is not None
-    assert 0.02 <= witness.proof.inter_event < 0.2
+    assert 0.02 <= float(witness.proof.inter_event) < 0.2
 
 
 @pytest.mark.parametrize("floor", [0.0, 0.01])

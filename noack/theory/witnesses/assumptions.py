@@ -124,7 +124,9 @@ def _needed_later(loop: Loop, document: Mapping[str, object], apart_s: float) ->
     assert isinstance(later, int)
     while later < _most_between(loop, loop.times.delay):
         with contextlib.suppress(RejectedError):
-            require_few_later(loop, Assumptions(None, later, 0, None), None if at_start else number(apart_s))
+            require_few_later(
+                loop, Assumptions(None, later, 0, None), None if at_start else number(apart_s).fmpq()
+            )
             break
         later += 1
     return later

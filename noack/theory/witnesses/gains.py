@@ -12,6 +12,7 @@ from noack.theory.response_bounds import NotDecayingError, lyapunov_decay
 from noack.theory.witnesses.assumptions import observer_decay
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError
+from noack_check.apart import share_of_threshold
 from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.gains import Gains, own_comparison
@@ -20,7 +21,7 @@ from noack_check.proof import compares_error
 
 _SHARES = (1.0, 0.5, 0.2, 0.0)
 """Rates that are tried, in multiples of the largest one."""
-_FIRST_S, _NEARLY, _STEPS = 1e-6, 0.98, 12
+_FIRST_S, _NEARLY, _STEPS = 1e-6, 0.99, 12
 """A time between events is accepted if e_s reaches nearly the threshold."""
 _AVERAGED = 2.0 ** np.arange(-8, 5)
 """Times over which an integral of the error is averaged, in time constants of the loop."""
@@ -151,17 +152,9 @@ def _comparison(loop: Loop) -> dict[str, object]:
 
 def _inter_event_s(gains: Gains) -> float:
     """Return a time before which e_s does not reach the threshold after an event; 0 if none is found."""
-    rule = gains.loop.rule
-    level, floor = float(rule.level), float(rule.floor)
-    if not bool(gains.rate == rule.rate):
-        level = 0.0
-    kinks = [0.0, 1.0] + ([floor / level] if level and floor < level else [])
 
     def share(time: float) -> float:
-        """Return the largest share of the threshold that is reached."""
-        decaying, constant = (float(each) for each in gains.reached(number(time)))
-        pairs = [(decaying * v + constant, max(level * v, floor)) for v in kinks]
-        return max((reached / limit if limit else np.inf for reached, limit in pairs if reached), default=0.0)
+        return float(share_of_threshold(gains, number(time)))
 
     short, at_once, time = 0.0, share(0.0), _FIRST_S
     for _ in range(_STEPS if at_once < _NEARLY else 0):

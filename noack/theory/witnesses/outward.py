@@ -4,7 +4,7 @@ import math
 from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
 
-from flint import arb
+from flint import arb, fmpq
 
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
 from noack.theory.witnesses.effort import NoWitnessError
@@ -50,21 +50,25 @@ def proven_bounds(proof: Proof, loop: Loop) -> ProvenBounds:
 
 def above(value: arb) -> float:
     """Return a float of twelve digits that is at least a number, which is not negative."""
-    found, exact = _rounded(value.upper(), ROUND_CEILING)
+    found, exact = _rounded(_exact(value.upper()), ROUND_CEILING)
     return math.nextafter(found, math.inf) if Fraction(found) < exact else found
 
 
-def below(value: arb) -> float:
+def below(value: arb | fmpq) -> float:
     """Return a float of twelve digits that is at most a number; 0 for one that may be negative."""
-    found, exact = _rounded(value.lower().max(arb(0)), ROUND_FLOOR)
+    least = value if isinstance(value, fmpq) else _exact(value.lower().max(arb(0)))
+    found, exact = _rounded(least, ROUND_FLOOR)
     return math.nextafter(found, -math.inf) if Fraction(found) > exact else found
 
 
-def _rounded(value: arb, rounding: str) -> tuple[float, Fraction]:
+def _exact(value: arb) -> fmpq:
     if not math.isfinite(float(value)):
         raise NoWitnessError("a bound is too large for floating point")
-    parts = value.mid().fmpq()
-    exact = Fraction(int(parts.p), int(parts.q))
+    return value.fmpq()
+
+
+def _rounded(value: fmpq, rounding: str) -> tuple[float, Fraction]:
+    exact = Fraction(int(value.p), int(value.q))
     if exact == Fraction(short := float(f"{float(value):.{_DIGITS}g}")):
         return short, exact
     context = Context(prec=_DIGITS, rounding=rounding, Emin=MIN_EMIN, Emax=MAX_EMAX)

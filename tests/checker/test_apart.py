@@ -1,0 +1,178 @@
+"""Times between events by gains: a run nearly has them, and each condition counts."""
+
+import copy
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import fmpq
+from scipy.linalg import expm
+
+from noack.theory.witnesses.documents import witness_by_gains
+from noack_check.apart import _sum_of_vectors, reached, share_of_threshold
+from noack_check.balls import beside, identity, matrix, number, square, zeros
+from noack_check.check import RejectedError
+from noack_check.gains import Gains
+from noack_check.loop import Loop, Times
+from noack_check.proof import Proof, prove
+from tests.checker.runs import floats
+from tests.checker.test_gains import changed, scalar
+from tests.checker.test_witnesses import IDEAL, SCHEDULE
+
+_NEAR = 0.97
+"""The share of the least time of a run that is proven, at least."""
+_STEP_S = 5e-4
+NOISE = number(0.05) * identity(1)
+
+
+def steady(losses: int, *, level: float = 0.0, disturbance: float = 0.05, times: Times = IDEAL) -> Loop:
+    """Return ẋ = x + 2u + d, u = −0.505 x, and the same model: errors of lost updates nearly stay.
+
+    The threshold is max(level e^{−0.005t}, 1).
+    """
+    loop = scalar(losses, times, level=level, floor=1.0)
+    return loop._replace(
+        gain=number(-0.505) * identity(1),
+        pushes=identity(1),
+        sizes=(number(disturbance),),
+        rule=loop.rule._replace(rate=number(0.005)),
+    )
+
+
+def proven(loop: Loop) -> tuple[dict[str, Any], Proof]:
+    witness = witness_by_gains(loop, ("x", "e_s", "e_c"))
+    return dict(witness.document), witness.proof
+
+
+def least_time(loop: Loop, until_s: float = 40.0) -> float:
+    """Return the least time between events of a run in which all pushes e_s up, after the threshold is 1.
+
+    As many updates as may be are lost, one after the other; the others act as late as they may. Each
+    measurement has the noise that brings the next event nearer.
+    """
+    H, gain, delay = float(floats(loop.H)[0, 0]), 2 * 0.505, float(loop.times.delay)
+    level, push = float(loop.rule.level), float(loop.sizes[0])
+    noise = float(loop.noise[0, 0]) if loop.noise.ncols() else 0.0
+    F = np.array([[H + gain, gain, push], [0.0, H, 0.0], [0.0, 0.0, 0.0]])
+    step, decay = expm(F * _STEP_S), math.exp(H * _STEP_S)
+    e, lost, events = noise, 0, [-math.inf]
+    missing: list[list[float]] = []
+    """Of each event since the last one that acts: when its update acts, and its part of w."""
+    found = [math.inf]
+    for t in np.arange(0.0, until_s, _STEP_S).tolist():
+        acting = [k for k, (acts, _) in enumerate(missing) if acts <= t]
+        if acting:
+            del missing[: acting[-1] + 1]
+        w = sum(part for _, part in missing)
+        e = float((step @ [e, w, 1.0])[0])
+        missing = [[acts, decay * part] for acts, part in missing]
+        if e + noise > max(level * math.exp(-0.005 * t), 1.0):
+            is_lost = lost < loop.losses
+            lost = lost + 1 if is_lost else 0
+            missing.append([math.inf if is_lost else t + delay, e - noise])
+            if level * math.exp(-0.005 * t) < 1:
+                found.append(t - events[-1])
+            events.append(t)
+            e = noise
+    return min(found)
+
+
+@pytest.mark.parametrize(
+    "loop",
+    [
+        steady(0, disturbance=1.0),
+        steady(1),
+        steady(2),
+        steady(5),
+        steady(2, level=1.1),
+        steady(0, disturbance=1.0)._replace(noise=NOISE),
+    ],
+    ids=["a disturbance", "one loss", "two losses", "five losses", "a threshold with a kink", "noise"],
+)
+def test_a_run_nearly_has_the_least_time(loop: Loop) -> None:
+    """So 1.05 times the proven one is false, and rejected."""
+    document, proof = proven(loop)
+    assert proof.inter_event is not None
+    shortest, stated = least_time(loop), float(proof.inter_event)
+    assert _NEAR * shortest < stated <= shortest
+    document = copy.deepcopy(document)
+    document["gains"]["inter_event_s"] *= 1.05
+    assert document["gains"]["inter_event_s"] > shortest
+    with pytest.raises(RejectedError, match="an event may come earlier"):
+        prove(loop, document)
+
+
+@pytest.mark.parametrize(
+    ("loop", "lie"),
+    [
+        (steady(2), steady(1)),
+        (steady(0, disturbance=1.0), steady(0, disturbance=0.8)),
+        (
+            steady(0, times=IDEAL._replace(delay=fmpq(1, 2))),
+            steady(0, times=IDEAL._replace(delay=fmpq(1, 20))),
+        ),
+        (steady(0, disturbance=1.0)._replace(noise=NOISE), steady(0, disturbance=1.0)),
+    ],
+    ids=["a loss", "a disturbance", "a delay", "noise"],
+)  # fmt: skip
+def test_a_time_for_less_is_not_one_for_more(loop: Loop, lie: Loop) -> None:
+    true, false = proven(loop)[1].inter_event, proven(lie)[0]["gains"]["inter_event_s"]
+    assert true is not None
+    assert float(true) <= least_time(loop) < false
+    document = copy.deepcopy(proven(loop)[0])
+    document["gains"]["inter_event_s"] = false
+    with pytest.raises(RejectedError, match="an event may come earlier"):
+        prove(loop, document)
+
+
+def test_both_parts_of_a_threshold_do_not_count_at_its_kink() -> None:
+    """There v = 0.1, and 9v + 1 is what two units make of a threshold of 1."""
+    loop = steady(2, level=10.0)
+    document, _ = proven(loop)
+    gains = Gains(loop, number(document["rate"]), document["gains"])
+    time = number(document["gains"]["inter_event_s"])
+    assert gains.single is not None
+    assert share_of_threshold(gains, time) < 1
+    sizes = {unit.unit.has_start: float(reached(unit, time)) for unit in gains.units}
+    assert 0.1 * sizes[True] + sizes[False] > 1.8
+
+
+def test_vectors_add_up_to_at_most_what_signs_can_make_of_them() -> None:
+    rng = np.random.default_rng(5)
+    for n, k in itertools.product((1, 2, 3), (1, 2, 3, 5)):
+        columns, sizes = rng.normal(size=(n, k)), rng.uniform(0, 1, k)
+        most = max(
+            np.linalg.norm(columns @ (sizes * signs)) for signs in itertools.product((-1.0, 1.0), repeat=k)
+        )
+        lengths = float(np.linalg.norm(columns, axis=0) @ sizes)
+        found = float(_sum_of_vectors(square(matrix(columns.tolist())), [number(each) for each in sizes]))
+        assert most * (1 - 1e-12) <= found <= lengths * (1 + 1e-12)
+        if k < 3:
+            assert found == pytest.approx(most)
+
+
+# Events are at tests.
+
+
+def test_the_next_test_after_silent_ones_is_the_first_that_may_be_an_event() -> None:
+    loop = scalar(0, SCHEDULE._replace(sampling=fmpq(1, 50), least_sampling=fmpq(1, 50)))
+    document, proof = proven(loop)
+    stated, tests = document["gains"]["inter_event_s"], proof.inter_event
+    assert tests is not None
+    assert 1 / 50 < stated < float(tests) < stated + 1 / 50
+    assert (50 * tests).q == 1
+    nearer = prove(changed(loop, least_sampling=fmpq(1, 51)), document).inter_event
+    assert nearer == fmpq(50, 51) * tests
+
+
+def test_without_a_comparison_events_are_as_far_apart_as_tests() -> None:
+    relative = scalar(0, SCHEDULE)
+    relative = relative._replace(
+        rule=relative.rule._replace(negative=number(0.05) * beside(identity(1), zeros(1, 1)))
+    )
+    assert proven(relative)[1].inter_event == SCHEDULE.least_sampling
+    assert proven(relative._replace(times=IDEAL))[1].inter_event is None
+    held = changed(relative, dwell=fmpq(1, 5))
+    assert proven(held)[1].inter_event == fmpq(1, 5)
