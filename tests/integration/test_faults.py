@@ -46,7 +46,7 @@ def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     assert running.left_behind() == []
 
 
-@pytest.mark.parametrize("role", ["sensor", "netem", "recorder"])
+@pytest.mark.parametrize("role", ["netem", "recorder"])
 def test_a_killed_process_ends_the_run_and_no_recorded_row_is_lost(start: Start, role: str) -> None:
     """The rows of the others are complete; the killed one may not have handed over its last ones."""
     running = start(*LONG)

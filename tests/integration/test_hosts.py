@@ -2,11 +2,10 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -137,64 +136,6 @@ def test_several_loops_run_on_hosts_with_different_clocks(
         "controller": (1_000_000, "clocks.largest_error_us"),
     }
     assert len({clock.clock for clock in clocks.values()}) == 3  # each `unshare` makes a clock
-
-
-def test_a_host_whose_clock_may_be_off_by_too_much_does_not_join(start: Start, tmp_path: Path) -> None:
-    recording = record(start, tmp_path)
-    away = start_away(start, "sensor", environment=chronyc(tmp_path, TRACKING.format(offset_s=0.0007)))
-    _, stderr = wait_for_end(away)
-    assert away.returncode == 1
-    assert stderr.splitlines()[-1] == (
-        "noack sensor: cannot join: the clock of the sensor's host may be off by 1100 µs, as `chronyc "
-        "tracking` says; clocks.largest_error_us = 1000 allows less"
-    )
-    recording.terminate()
-    wait_for_end(recording)
-
-
-def _of_another_run(folder: Path, third: Path) -> None:
-    for name in ("certificate.pem", "private_key.pem"):
-        shutil.copy(third / "controller" / name, folder / name)
-
-
-def _none(folder: Path, third: Path) -> None:
-    for name in ("certificate.pem", "private_key.pem"):
-        (folder / name).write_bytes(b"")
-
-
-def _of_another_role(folder: Path, third: Path) -> None:
-    for name in ("certificate.pem", "private_key.pem"):
-        shutil.copy(folder.parent / "credentials" / "sensor" / name, folder / name)
-
-
-@pytest.mark.parametrize(
-    ("take", "reason"),
-    [
-        (_of_another_run, "it is busy, or did not accept these credentials; each run has new ones"),
-        (_none, "it is busy, or did not accept these credentials; each run has new ones"),
-        (_of_another_role, "the run did not answer the request 'admit' within 10 s"),
-    ],
-)
-def test_the_certificates_of_a_third_party_admit_nobody(
-    start: Start, tmp_path: Path, take: Callable[[Path, Path], None], reason: str
-) -> None:
-    """It knows the run, by the file `run.json` of the controller, but has no key of the controller."""
-    recording = record(start, tmp_path)
-    third = tmp_path / "third"
-    more = ("--credentials", str(third), "--session", "third")
-    other = start(0, "record", "lane_following", "--listen", f"{LISTEN}:7448", *live.BARE, *more)
-    live.wait_for(lambda: third.exists() or other.poll() is not None)
-    stolen = tmp_path / "stolen"
-    shutil.copytree(tmp_path / "credentials" / "controller", stolen)
-    take(stolen, third)
-    thief = start(1, "controller", "--credentials", str(stolen))
-    _, stderr = wait_for_end(thief)
-    assert thief.returncode == 1
-    assert reason in stderr.splitlines()[-1]
-    assert "Traceback" not in stderr
-    for process in (recording, other):
-        process.terminate()
-        wait_for_end(process)
 
 
 @pytest.mark.usefixtures("hosts")

@@ -130,23 +130,6 @@ def test_the_limit_bounds_the_datagrams_and_copies_in_flight(words: str, overflo
     assert fate_of(link, 0, 20 * MS) is Fate.DELIVERED
 
 
-@given(st.lists(st.integers(0, 2), max_size=60), st.none() | st.integers(0, 3))
-def test_every_datagram_is_counted_once(order: list[int], mansd: int | None) -> None:
-    cap = "" if mansd is None else f"mansd {mansd}"
-    link = new_link(f"{ALL_TIMELESS} rate 1mbit queue 3 blackout 10ms-30ms {cap}")
-    all_fates = [fate_of(link, flow, k * MS) for k, flow in enumerate(order)]
-    drain(link)
-    counters = link.counters
-    counted = (
-        counters.delivered, counters.dropped, counters.forced,
-        counters.corrupted, counters.overflowed, counters.blacked_out,
-    )  # fmt: skip
-    assert list(counted) == [all_fates.count(fate) for fate in Fate]
-    assert counters.received == len(order)
-    effective = counters.delivered + counters.forced
-    assert counters.forwarded == effective + counters.corrupted + counters.duplicated
-
-
 @pytest.mark.parametrize(
     ("network", "expected"),
     [

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from cosim.analysis.explained_run.explain import explains
 from cosim.analysis.explained_run.findings import SCHEDULE
 from cosim.record.run_record import Rows, RunRecord
-from cosim.shipped_files import shipped_names
 from cosim.simulation.virtual_time import simulate_loops
 from noack.protocol.record_tables import NO_SEQUENCE, Fate
 from noack.scenario.resolution import resolve_run
@@ -205,14 +204,6 @@ def test_a_run_that_diverges_is_explained_up_to_its_first_extreme_number() -> No
     tables = copied(record)
     tables["plant_step"]["x"][20] += 1e-3
     assert explains(changed(record, tables))
-
-
-@pytest.mark.parametrize("name", shipped_names("scenarios"))
-def test_runs_of_shipped_scenarios_are_explained(name: str) -> None:
-    run = simulate_loops(resolve_run(shipped(name, "horizon_s=1.5")))
-    for record in [*run.loops][:4]:
-        findings = explains(record)
-        assert not findings, "\n".join(map(str, findings[:5]))
 
 
 def test_a_watchdog_may_replace_inputs_where_actuations_may_be_lost() -> None:

@@ -60,6 +60,7 @@ def test_numbers_may_be_those_of_numpy(result: noack.CampaignResult) -> None:
     assert first == same
 
 
+@pytest.mark.usefixtures("short_searches")
 def test_a_system_is_certified(scenario: noack.Scenario) -> None:
     certificates = noack.certify(scenario)
     assert pickle.loads(pickle.dumps(certificates)).to_json() == certificates.to_json()

@@ -17,6 +17,7 @@ import pytest
 import noack
 from tests.helpers.command_line import invoke
 
+pytestmark = pytest.mark.usefixtures("short_searches")
 OVERLOADED = {
     "trigger": {"policy": "periodic", "period_s": 0.01},
     "network.impairments": [{"kind": "rate", "rate_bps": 8000}],
@@ -106,6 +107,8 @@ RESULTS: dict[str, Call] = {
     "replay only_scenario": lambda: noack.open_run("only_scenario").replay(),
     "report only_scenario": lambda: noack.open_run("only_scenario").report(),
     "replay campaign.toml": lambda: noack.open_run("campaign.toml").replay(),
+    "summary HERE/no_record": lambda: noack.open_run("no_record").summary,
+    "replay HERE/no_record": lambda: noack.open_run("no_record").replay(),
     "replay HERE/damaged": lambda: noack.open_run("damaged").replay(),
     "replay several --loop nobody": lambda: noack.open_run("several").loops["nobody"].replay(),
     "report folder": lambda: noack.open_run("folder").report(),

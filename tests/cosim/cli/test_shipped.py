@@ -1,45 +1,17 @@
-"""The shipped scenarios: each runs on each user interface; ``noack scenarios`` copies them."""
+"""``noack scenarios`` lists the shipped scenarios and prints them."""
 
 import json
 import tomllib
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-import noack
-from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario_file import load
 from tests.helpers.command_line import invoke
 
 ROOT = Path(__file__).parents[3]
 SCENARIOS = sorted(file.stem for file in (ROOT / "scenarios").glob("*.toml"))
 CAMPAIGNS = sorted(file.stem for file in (ROOT / "campaigns").glob("*.toml"))
-LANES = ("lane_following", "lane_acknowledged", "lane_actuation_loss", "lane_crosswind")
-"""Of the scenarios of the lane, those whose recordings and summaries have parts of their own."""
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_a_shipped_scenario_runs_from_the_command_line_and_in_the_library(name: str, tmp_path: Path) -> None:
-    scenario = noack.load(name, {"horizon_s": 0.2})
-    try:
-        resolved_loops(scenario)
-    except noack.NoackError as error:
-        if "pip install" not in str(error):
-            raise
-        pytest.skip(str(error))
-    checked = invoke("check", name)
-    assert checked.exit_code == 0, checked.output
-    if scenario.loops:  # tests/cosim/test_scenarios.py and simulation/test_simulated_run.py run them
-        return
-    with suppress(noack.NoackError):  # the exact simulation does not cover every scenario
-        assert noack.simulate_exactly(scenario).summary.reached_s == pytest.approx(0.2)
-    if name.startswith("lane_") and name not in LANES:  # tests/cosim/test_scenarios.py runs it whole
-        return
-    short = ["simulate", name, "--set", "horizon_s=0.2", "--runs", str(tmp_path), "--no-report"]
-    simulated = invoke(*short, "--json")
-    assert simulated.exit_code == 0, simulated.output
-    assert json.loads(simulated.stdout)["exit"]["status"] == 0
 
 
 def test_all_shipped_scenarios_are_listed_with_their_description() -> None:

@@ -13,13 +13,10 @@ from tests.helpers.command_line import invoke
 FILES = (Path(__file__).parents[3] / "scenarios").glob("*.toml")
 LIKE_OTHERS = {"lane_5g_arterial", "lane_5g_rural", "lane_weighted"}
 """Other numbers of scenarios that are tried."""
-LONG = {
-    "different_loops", "f16_lateral", "kinematic_car", "lane_5g_urban", "lane_constrained", "lane_crosswind",
-    "lane_periodic", "shared_channel", "sine_pendulum",
-}  # fmt: skip
-"""Scenarios that take seconds each, also without a search."""
+USUAL = {"lane_following", "dc_motor_load", "friction_servo", "model_predictive"}
+"""Scenarios that are tried by every ``make test``: a linear plant, a load, equations, no bounds."""
 SCENARIOS = [
-    pytest.param(name, marks=pytest.mark.system if name in LONG else ())
+    pytest.param(name, marks=() if name in USUAL else pytest.mark.system)
     for name in sorted({file.stem for file in FILES} - LIKE_OTHERS)
 ]
 

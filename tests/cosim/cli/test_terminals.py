@@ -70,12 +70,8 @@ def test_a_line_is_written_at_once(line_buffering: bool, write_through: bool) ->
     "words",
     [
         ["cosim.cli", "scenarios"],
-        ["cosim.cli", "netem", "--help"],
-        ["cosim.cli", "netem", "--explain", "loss", "5%"],
         ["cosim.cli", "netem", "set", "--help"],
-        ["netem", "--help"],
         ["netem", "--explain", "loss", "5%"],
-        ["netem", "set", "--help"],
         ["plant_server", "--help"],
     ],
     ids="-".join,

@@ -1,7 +1,5 @@
 """The time without a certificate, against a step through the trace."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,7 +12,6 @@ from noack.scenario.scenario import Scenario
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 
 MS = 1_000_000
-TRACES = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
 
 
 def lane(**network: object) -> Scenario:

@@ -7,7 +7,6 @@ import math
 from typing import Any
 
 import numpy as np
-import pytest
 
 from cosim.record.align import (
     AlignedRun,
@@ -18,7 +17,6 @@ from cosim.record.align import (
     shares_update,
 )
 from cosim.record.run_record import Rows
-from noack.core.references import ModelFlow, Reference, ReferenceInForce
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.scenario.resolution import LoopMatrices
 from noack.scenario.scenario import Scenario
@@ -97,31 +95,6 @@ def test_the_newest_state_is_propagated_to_each_measurement() -> None:
     np.testing.assert_allclose(aligned.x_c, expected, rtol=1e-14)
     assert aligned.received.tolist() == [NO_SEQUENCE, 0, 0, 0, 0, NO_SEQUENCE]
     np.testing.assert_allclose(aligned.e_c_norm, np.linalg.norm(expected, axis=1), rtol=1e-14)
-
-
-@pytest.mark.parametrize("split", range(7))
-def test_a_track_in_parts_is_the_whole_track(split: int) -> None:
-    numbers = [0, *sorted([*TICKS["input"], *UPDATES["input"]])]
-    last = numbers[split]
-    early, delivered = TICKS["input"] <= last, UPDATES["input"] <= last
-    track = controller_track(START, TICKS[early], UPDATES[delivered])
-    track = controller_track(track, TICKS[~early], UPDATES[~delivered])
-    full_track = controller_track(START, TICKS, UPDATES)
-    for values, expected in zip(track, full_track, strict=True):
-        np.testing.assert_array_equal(values, expected)
-    later_track = full_track.since(int(np.searchsorted(full_track.model_ns, 20 * MS, "right")) - 1)
-    np.testing.assert_array_equal(align(later_track, [20, 30, 55]).x_c, align(full_track, [20, 30, 55]).x_c)
-
-
-def test_the_model_follows_its_set_point_from_the_change_on() -> None:
-    in_force, set_point = ReferenceInForce(None, 2, 1), np.array([4.0, -2.0])
-    in_force.change(15 * MS, Reference.constant(set_point, np.zeros(1)))
-    flow = ModelFlow(LOOP.H, in_force.reference)
-    track = controller_track(START, TICKS[:1], UPDATES[:1])
-    aligned = align(track, [10, 15, 30], flow=flow)
-    at_change = decayed([2.0, 1.0], 5)
-    expected = [[2.0, 1.0], at_change, set_point + decayed(at_change - set_point, 15)]
-    np.testing.assert_allclose(aligned.x_c, expected, rtol=1e-14)
 
 
 def test_sensor_and_controller_share_an_update_once_one_is_delivered() -> None:

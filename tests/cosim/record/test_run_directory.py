@@ -83,6 +83,15 @@ def test_a_damaged_column_or_report_is_refused_or_ignored(run_dir: Path) -> None
         load_record(run_dir)
 
 
+def test_a_flipped_bit_of_a_row_is_noticed(run_dir: Path) -> None:
+    path = run_dir / RECORD / f"{PLANT_STEP}.parquet"
+    content = path.read_bytes()
+    footer_bytes = int.from_bytes(content[-8:-4], "little") + 8
+    path.write_bytes(flipped(content, 8 * (len(content) - footer_bytes) - 1))
+    with pytest.raises(CallerError, match="cannot be read"):
+        _ = load_record(run_dir)[PLANT_STEP]
+
+
 def test_the_readable_part_of_a_damaged_spool_is_read(run_dir: Path) -> None:
     record = load_record(run_dir)
     rows, steps = spooled(record, PLANT_STEP), len(record[PLANT_STEP])

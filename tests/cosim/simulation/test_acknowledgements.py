@@ -6,7 +6,6 @@ import pytest
 
 from cosim.analysis.certificates import Certificates
 from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of
@@ -15,14 +14,7 @@ from noack.core.errors import CallerError
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.protocol.record_tables import (
-    ACKNOWLEDGEMENTS,
-    CONTROLLER_DELIVERY,
-    NETEM_PACKET,
-    SENSOR_ACKNOWLEDGEMENT,
-    UPDATES,
-    Fate,
-)
+from noack.protocol.record_tables import ACKNOWLEDGEMENTS, NETEM_PACKET, UPDATES, Fate
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from tests.helpers.shipped import resolved
@@ -61,19 +53,6 @@ def test_each_direction_has_its_own_random_stream() -> None:
     expected = [Fate(link.decide(ACKNOWLEDGEMENTS, 48, 0).fate) for _ in answers]
     assert answers == expected
     assert {Fate.DELIVERED, Fate.DROPPED} == set(answers)
-
-
-def test_the_summary_counts_acknowledgements() -> None:
-    record = run_of()
-    summary = summarise_loop(record, 0, "horizon").to_json()
-    counts = summary["acknowledgements"]
-    assert counts["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
-    assert counts["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
-    assert counts["lost"] > 0
-    assert 0 <= counts["sent"] - counts["lost"] - counts["received"] <= 2  # in flight at the end
-    assert summary["unintended_losses"] == summary["missing_samples"] == 0
-    assert summary["identity_residual_max"] is None
-    assert summarise_loop(simulate(plain()), 0, "horizon").acknowledgements is None
 
 
 def test_the_baseline_has_no_claims() -> None:

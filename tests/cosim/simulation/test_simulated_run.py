@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,11 +14,10 @@ from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint
 from cosim.record.run_directory import RunEnding, write_environment
 from cosim.record.run_record import RecordedRun, RunRecord, load_record
-from cosim.simulation.virtual_time import Progress, simulate, simulate_run
+from cosim.simulation.virtual_time import Progress, simulate_run
 from noack.core.errors import ExitStatus, MachineError
 from noack.core.number_format import number as written
 from noack.protocol.record_tables import tables
-from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.helpers.command_line import invoke
@@ -104,36 +102,6 @@ def test_a_run_that_is_simulated_again_has_the_same_bits(run_dir: Path, tmp_path
         assert repeated.read_bytes() == (run_dir / "record" / name).read_bytes()
 
 
-def test_commands_refuse_a_damaged_table_in_one_line(run_dir: Path, tmp_path: Path) -> None:
-    damaged = tmp_path / "damaged"
-    shutil.copytree(run_dir, damaged)
-    table = damaged / "record" / "sensor_measurement.parquet"
-    table_bytes = table.read_bytes()
-
-    def refused(*command: str) -> str:
-        result = invoke(command[0], damaged, *command[1:])
-        assert (result.exit_code, result.stderr.count("\n")) == (2, 1), result.output
-        assert result.stderr.startswith(f"noack: {table}: cannot be read: ")
-        return result.stdout
-
-    middle = len(table_bytes) // 2
-    changed_byte = bytes([table_bytes[middle] ^ 1])
-    table.write_bytes(table_bytes[:middle] + changed_byte + table_bytes[middle + 1 :])
-    for command in (["replay"], ["report"]):
-        refused(*command)
-    for kind, name in (("csv", "tables"), ("mat", "run.mat")):
-        refused("export", "--format", kind, "--out", str(tmp_path / name))
-    for content in (table_bytes[:middle], None):
-        table.unlink()
-        if content is not None:
-            table.write_bytes(content)
-        assert "bottleneck" in refused("summary")
-        assert json.loads(refused("summary", "--json"))["exit"]["status"] == 0
-    assert invoke("replay", damaged).stderr == f"noack: {table}: cannot be read: No such file or directory\n"
-    shutil.rmtree(table.parent)
-    assert invoke("summary", damaged).stderr == f"noack: {damaged}: has no numeric record\n"
-
-
 @pytest.mark.usefixtures("no_report", "no_recording")
 def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     own = "A = [[0.0, 1.0], [50.0, 0.0]], B = [[0.0], [1.0]]"
@@ -194,21 +162,6 @@ def test_a_simulated_run_has_the_files_of_a_live_run(runs: Path) -> None:
     paths = {chunk.entity_path.removeprefix("/") for chunk in reader.stream(store=store)}
     assert {blueprint.EVENT, blueprint.INPUT} <= paths
     assert not [path for path in paths if path.startswith("lateness")]
-
-
-def test_the_record_on_disk_equals_the_simulators(runs: Path) -> None:
-    simulated_record, loaded_record = (
-        simulate(resolve(load(ONE_LOOP, SETTINGS))),
-        load_record(runs / "latest"),
-    )
-    assert all(
-        simulated_record[table].tobytes() == loaded_record[table].tobytes()
-        for table in simulated_record.tables
-    )
-    assert loaded_record.scenario == simulated_record.scenario
-    assert loaded_record.kind == simulated_record.kind == "simulated"
-    assert loaded_record.reports == simulated_record.reports
-    assert loaded_record.notices == simulated_record.notices
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])

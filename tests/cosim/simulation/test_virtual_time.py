@@ -9,7 +9,7 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import VirtualRun, simulate
 from netem.channel import channel_of
 from noack.core.core_library import ffi, new_handle
-from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET
 from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.simulation.event_scheduler import record_of_run
@@ -25,11 +25,10 @@ def require_equal(record: RunRecord, expected: RunRecord) -> None:
     assert record.notices == expected.notices
 
 
-@pytest.mark.parametrize("first", range(len(POLICIES)))
-def test_random_loops_run_as_by_the_plain_driver(first: int) -> None:
-    for number in range(first, 2 * len(POLICIES), len(POLICIES)):
-        scenario = resolve(validate(random_scenario(number), "random"))
-        require_equal(simulate(scenario), record_of_run(scenario))
+@pytest.mark.parametrize("number", range(len(POLICIES)))
+def test_random_loops_run_as_by_the_plain_driver(number: int) -> None:
+    scenario = resolve(validate(random_scenario(number), "random"))
+    require_equal(simulate(scenario), record_of_run(scenario))
 
 
 @pytest.mark.sanitized
@@ -83,19 +82,6 @@ def test_the_controller_reports_a_violated_assumption(busy_content: dict[str, An
         assert violation["process"] == "controller"
         lost = "1 loss" if gap["dropouts"] == 1 else f"{gap['dropouts']} consecutive losses"
         assert f"MANSD violated: {lost} before" in violation["what"]
-
-
-def test_a_violation_without_a_later_delivery_is_reported(busy_content: dict[str, Any]) -> None:
-    loss = {"model": "worst_case"}
-    busy_content["network"] = {"mansd": 2, "enforce_mansd": False, "loss": loss}
-    record = simulate(resolve(validate(busy_content, "test")))
-    summary = summarise_loop(record, 0, "horizon").to_json()
-    (violation,) = summary["assumption_violations"]
-    events = record[SENSOR_MEASUREMENT]
-    event_ns = events["t_ns"][events["event"] >= 0]
-    # t_0 is delivered; two losses are allowed
-    assert violation["t_s"] == pytest.approx(event_ns[3] * 1e-9)
-    assert summary["longest_loss_burst"] == len(event_ns) - 1 > 2
 
 
 def test_each_packet_of_a_long_run_is_recorded_once_and_progress_is_reported(

@@ -3,7 +3,6 @@
 import io
 import json
 import re
-from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +19,7 @@ from netem.control.statistics_text import statistics_lines
 from netem.relay.relay_reports import FlowReport
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
-from tests.netem.control.fake_relay import FakeRelay, running, times
+from tests.netem.control.fake_relay import FakeRelay, running
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
 
@@ -86,28 +85,6 @@ def test_loss_is_counted_since_the_settings_came_into_force(relay: FakeRelay) ->
     recent = forward(statistics(snapshot_of(relay, 2, since), before))["recent"]
     assert recent is not None
     assert recent["loss"] == 1
-
-
-def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
-    """In second k, from 0 on, 1000 k datagrams of 100 bytes arrive on each link."""
-    all_statistics, before = [], None
-    for second in range(seconds):
-        for (_, side), counters in relay.counters.items():
-            if side == "forward":
-                received = 1000 * second
-                counters.received += received
-                counters.received_bytes += 100 * received
-                counters.dropped += received // 5
-                counters.forced += received // 10
-                counters.delivered += received - received // 5 - received // 10
-                counters.forwarded += received - received // 5
-                counters.forwarded_bytes += 100 * (received - received // 5)
-                counters.longest_loss_burst = 2
-        relay.delays = relay.delays + times(*[10_000_000] * 98, 20_000_000, 20_000_000)
-        snapshot = snapshot_of(relay, second + 1)
-        all_statistics.append(statistics(snapshot, before))
-        before = snapshot
-    return all_statistics
 
 
 PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()

@@ -7,7 +7,7 @@ import pytest
 
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.loops_over_time import INTERVALS, intervals_of, loop_over_time
-from cosim.analysis.summary.run_summary import counts_inside, in_flight, worst_loop
+from cosim.analysis.summary.run_summary import in_flight, worst_loop
 from cosim.analysis.summary.summary_model import LoopSummary
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -139,12 +139,3 @@ def test_what_is_in_flight_when_all_are_stopped_is_not_lost() -> None:
         reports["netem"] = reports["plant"] | of_netem
         summary = summarise_loop(changed(record, reports=reports), 130, "stopped by the user")
         assert summary.unintended_losses_by_leg.get("update to netem", 0) == lost
-
-
-def test_counts_of_two_overlapping_datagrams_have_a_closed_form() -> None:
-    """One is inside from 0 s to 20 s, the other from 10 s to 30 s."""
-    begin_ns, end_ns = np.array([0, 10]) * S, np.array([20, 30]) * S
-    edges_ns = np.array([0.0, 5.0, 15.0, 25.0, 40.0]) * S
-    means, largest = counts_inside(begin_ns, end_ns, edges_ns)
-    np.testing.assert_allclose(means, [1, 1.5, 1.5, 5 / 15], rtol=1e-12)
-    assert largest.tolist() == [1, 2, 2, 1]

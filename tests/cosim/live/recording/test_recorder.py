@@ -28,7 +28,6 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, validate
 from tests.cosim.simulation.outage import with_outage
 from tests.fuzz.plane import FakePlane, Query, Sample
-from tests.helpers.run_descriptors import JUNK
 from tests.helpers.shipped import resolved
 
 
@@ -99,25 +98,6 @@ def run(content: dict[str, Any], tmp_path: Path) -> Iterator[Run]:
     opened_run = Run(resolve(validate(content, "")), tmp_path)
     yield opened_run
     opened_run.recorder.store.writer.close()
-
-
-def test_invalid_telemetry_is_ignored_and_the_rest_is_stored(
-    run: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
-    row = np.zeros(1, run.recorder.store.types[PLANT_STEP]).tobytes()
-    header = b'{"first": 0, "rows": 1}'
-    for junk in JUNK:
-        run.plane.put("telemetry", Sample("t/plant/plant_step", junk, header))
-        run.plane.put("telemetry", Sample("t/plant/plant_step", row, junk))
-        run.plane.put("telemetry", Sample("t/sensor/plant_step", row, header))
-        run.plane.put("telemetry", Sample("t/plant/notices", junk, header))
-        run.plane.put("telemetry", Sample("t/plant/plant_step", row, header, "t/plant/plant_x"))
-        run.plane.put("report", bad := Query("report/plant", junk))
-        run.recorder.poll()
-        assert bad.error is not None
-    run.rows(PLANT_STEP, 1)
-    assert len(run.finished()[PLANT_STEP]) == 1
-    assert capsys.readouterr().err.count("ignored an invalid telemetry message") == 1
 
 
 def test_rows_that_a_process_has_stored_are_not_requested_and_are_logged(run: Run) -> None:
