@@ -50,7 +50,9 @@ def test_the_table_of_times_marks_what_was_later_than_allowed(outcome: Outcome) 
 
 
 def test_reasons_of_several_loops_that_differ_only_in_numbers_are_one_line(tmp_path: Path) -> None:
-    outcome = finalize(simulate_run(shipped("different_loops"), tmp_path), report=False, view=False)
+    outcome = finalize(
+        simulate_run(shipped("different_loops", "horizon_s=1"), tmp_path), report=False, view=False
+    )
     reasons = ["an input was old", "gain 1.5, not below 1", "gain 2.25, not below 1", "gain 1.5, not below 1"]
     loops = [
         loop.model_copy(update={"claims": [Claim(**claim("void", why=why))]})

@@ -173,14 +173,14 @@ def test_rows_missing_at_the_end_are_reported(role: str, record: RunRecord) -> N
     last = max(int(rows["input"][-1]) for rows in owned.values() if len(rows))
     shorter_rows = {table: rows[rows["input"] < last] for table, rows in owned.items()}
     others = {other_role: report for other_role, report in record.reports.items() if other_role != role}
-    for record, gap in (
+    for cut, gap in (
         (changed(record, shorter_rows), f"{role}: rows are missing from input {last} on"),
         (
             changed(record, reports=others),
             f"{role}: left no report; whether its last rows are missing is not known",
         ),
     ):
-        result = replay(record)
+        result = replay(cut)
         assert result.bit_exact
         assert result.gaps == [gap]
 

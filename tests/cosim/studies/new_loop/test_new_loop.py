@@ -109,7 +109,17 @@ def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
     command("new", "pole.json", "--out", "loop.toml", ok=False)  # it exists
 
 
-@pytest.mark.parametrize("name", ["cart_pole", "quadrotor", "dc_motor", "four_tank", "unstable_pendulum"])
+@pytest.mark.usefixtures("short_searches")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cart_pole",
+        pytest.param("quadrotor", marks=pytest.mark.system),  # takes a minute
+        pytest.param("dc_motor", marks=pytest.mark.system),
+        "four_tank",
+        "unstable_pendulum",
+    ],
+)
 def test_each_plant_of_noack_gets_a_scenario(name: str) -> None:
     made = noack.new(name, "made.toml")
     made.save("made.toml")
