@@ -36,12 +36,14 @@ PLATFORMS = {
 """The platforms for which ``make dist`` builds wheels, each by its tag: ziglang's names of them."""
 OWN = f"{sys.platform}_{platform.machine()}".lower()
 """The platform of this machine."""
-_LIVE = ("driver/driver.c", "driver/sockets.c", "relay/*.c")
+_LIVE = ("driver/driver.c", "driver/sockets.c", "driver/*tags.c", "relay/*.c")
 """Sockets and timers of live runs: only Linux has them. Elsewhere the library is without them."""
 _SCRATCH = ".building-"
 _STATES = "states.c"
 """The exact simulator's code for a fixed number of states; it is compiled for each of these:"""
 _SIZES = (64, 16, 8, 4, 3)
+_FOUR_TAGS = "four_tags.c"
+"""Tags of several datagrams at once, for which an x86-64 needs AVX2."""
 _FUSED = ("-DFUSED", "-mavx2", "-mfma")
 # The vectors stay 256 bits wide: twice as many registers are what speeds the code up.
 _WIDE = (
@@ -188,13 +190,15 @@ def _units(target: str) -> list[tuple[Path, tuple[str, ...]]]:
     """Return the files to compile, each with its own flags; those that take longest are first."""
     states = HERE / "exact" / _STATES
     sizes: list[tuple[str, ...]] = [(f"-DN={size}",) for size in _SIZES]
+    tags: tuple[str, ...] = ()
     if target.endswith(("x86_64", "amd64")):  # three sizes without AVX2 and FMA
         fused = [(*size, *_FUSED) for size in sizes]
         wide = [(size, *_FUSED, *_WIDE) for size in ("-DN=8", "-DN=4")]
         sizes = [*fused, *wide, ("-DN=64",), ("-DN=4",), ("-DN=3",)]
+        tags = ("-mavx2",)
     return [
         *((states, flags) for flags in sizes),
-        *((file, ()) for file in sources(target) if file != states),
+        *((file, tags if file.name == _FOUR_TAGS else ()) for file in sources(target) if file != states),
     ]
 
 

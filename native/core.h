@@ -252,6 +252,12 @@ static inline void copy_datagram(noack_datagram *to, const noack_datagram *from)
     memcpy(to, from, offsetof(noack_datagram, message.vector) + entries * sizeof(double));
 }
 
+/* wire.c: a message's datagram without its tag, of which the size is returned; its tag;
+   and whether bytes that were received are a tag. */
+int64_t write_content(const noack_wire *wire, const noack_message *message, uint8_t *datagram);
+void write_tag(const noack_wire *wire, int64_t content_bytes, uint8_t *datagram);
+int is_tag(const uint64_t tag[NOACK_TAG_BYTES / 8], const uint8_t *bytes);
+
 /* wire.c: the header of a message's datagram; and the tests of an authentic datagram. */
 void noack_wire_header(const noack_wire *wire, const noack_message *message, uint8_t *header);
 int64_t noack_wire_examine_message(

@@ -53,7 +53,8 @@ void noack_driver_free(noack_driver *driver) {
     free(driver);
 }
 
-/* Write the datagram of the message that a machine sends, if it sends one. There must be room. */
+/* Write the datagram of the message that a machine sends, without its tag, if it sends one. There
+   must be room. */
 static void put_output(noack_driver *driver) {
     driver_scratch *scratch = scratch_of(driver);
     const noack_output *output = &driver->process->output;
@@ -63,7 +64,8 @@ static void put_output(noack_driver *driver) {
     int64_t place = scratch->out_count++;
     scratch->out_flows[place] = output->message.flow == NOACK_ACKNOWLEDGEMENT;
     scratch->out_vectors[place].iov_len =
-        (size_t)noack_wire_encode(&driver->wire, &output->message, scratch->out_data[place]);
+        (size_t)write_content(&driver->wire, &output->message, scratch->out_data[place])
+        + NOACK_TAG_BYTES;
 }
 
 /* Show Python the datagram that it opens or seals. */
@@ -114,7 +116,8 @@ static int64_t examine(noack_driver *driver) {
     if (driver->opened != NOACK_NOT_AUTHENTIC)
         examination = noack_wire_examine(
             &driver->wire, reception, max_of(loop, 0), datagram, size_bytes,
-            is_peer(current->name, &driver->sources[is_answer]), driver->opened, &scratch->message);
+            is_peer(current->name, &driver->sources[is_answer]),
+            current->has_tag ? NOACK_OPENED : driver->opened, &scratch->message);
     if (examination == NOACK_ENCRYPTED)
         return NOACK_DRIVER_OPEN;
     driver->opened = NOACK_NOT_OPENED;
@@ -259,6 +262,8 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
             scratch->reason = do_steps(driver);
         if (must_seal(driver))
             return NOACK_DRIVER_SEAL;
+        if (scratch->out_count > 0 && !driver->wire.encrypted)
+            write_tags(driver);
         if (scratch->out_count > 0)
             send_datagrams(driver);
         if (scratch->reason == NOACK_DRIVER_OPEN)

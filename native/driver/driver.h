@@ -24,6 +24,7 @@ typedef struct { /* a datagram that was received */
     uint8_t *data;
     int64_t size_bytes;
     const uint8_t *name;
+    int has_tag; /* 1: its tag has been found right */
 } arrival;
 
 typedef struct driver_scratch {
@@ -54,6 +55,17 @@ typedef struct driver_scratch {
 } driver_scratch;
 
 static inline driver_scratch *scratch_of(const noack_driver *driver) { return driver->scratch; }
+
+/* four_tags.c: the tags of datagrams with the same number of bytes of content, a multiple of 8. */
+enum { FOUR = 4, MOST_TAGGED_BYTES = 128 };
+void tag_four(
+    const noack_wire *wire, int64_t content_bytes, uint8_t *const datagrams[FOUR],
+    uint64_t tags[FOUR][NOACK_TAG_BYTES / 8]);
+
+/* tags.c: the tags of what waits to be sent; and whether the datagrams that were taken have the
+   right one, where four are compared at once. The others are compared when they are examined. */
+void write_tags(noack_driver *driver);
+void compare_tags(noack_driver *driver);
 
 /* sockets.c */
 

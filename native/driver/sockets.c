@@ -81,7 +81,7 @@ void noack_driver_add_datagram(
     if (scratch->in_next == scratch->in_end)
         scratch->in_next = scratch->in_end = 0;
     scratch->arrivals[scratch->in_end++] =
-        (arrival){place, size_bytes, scratch->in_names[MESSAGES - 1]};
+        (arrival){place, size_bytes, scratch->in_names[MESSAGES - 1], 0};
 }
 
 /* Send datagrams of one size as one message, which goes through the kernel once. Return their
@@ -181,7 +181,7 @@ void take_datagrams(noack_driver *driver) {
             min_of(segment_bytes(&scratch->in_headers[message]), all_bytes - scratch->taken_bytes);
         const uint8_t *name = scratch->in_names[message];
         scratch->arrivals[scratch->in_end++] =
-            (arrival){scratch->in_data[message] + scratch->taken_bytes, size_bytes, name};
+            (arrival){scratch->in_data[message] + scratch->taken_bytes, size_bytes, name, 0};
         scratch->taken_bytes += size_bytes;
         int64_t source = 0;
         while (source < 2 && !is_peer(name, &driver->sources[source]))
@@ -196,6 +196,8 @@ void take_datagrams(noack_driver *driver) {
             scratch->message_next++;
         }
     }
+    if (!driver->wire.encrypted)
+        compare_tags(driver);
 }
 
 void receive_datagrams(noack_driver *driver, int64_t ready) {

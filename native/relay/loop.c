@@ -285,7 +285,7 @@ static void decide(noack_relay *relay, int64_t direction, int64_t row, int64_t s
     noack_decision decision;
     client->last_ns = relay->now_ns;
     serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
-    if (!relay->devices)
+    if (!relay->devices && link->scheduler >= 0)
         link->flows[client->flow_row].error_level = noack_wire_error_level(data, size_bytes);
     noack_link_decide(
         link, client->flow_row, max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns,

@@ -9,6 +9,7 @@ import socket
 import struct
 from collections.abc import Sequence
 from contextlib import closing
+from hashlib import blake2b
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,10 @@ import pytest
 from noack.core.core_library import core
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import Record
-from noack.protocol.wire_format import Flow, Message
+from noack.protocol.wire_format import TAG_BYTES, Flow, Message, Rejection
 from noack.runtime.drivers.live_driver import LiveDriver
 from tests.helpers.wire_decoder import NO_VECTOR
-from tests.noack.runtime.drivers.live_loops import HOUR_NS, Live, measurement, plain, received, scenario
+from tests.noack.runtime.drivers.live_loops import HOUR_NS, KEY, Live, measurement, plain, received, scenario
 
 NOW = "now_ns"
 
@@ -73,13 +74,32 @@ def test_datagrams_that_the_kernel_passes_together_are_handled_one_by_one(
 
 
 @pytest.mark.sanitized
+@pytest.mark.parametrize("forged", range(10))
+def test_a_forged_tag_among_others_is_rejected_alone(content: dict[str, Any], forged: int) -> None:
+    """Four tags are compared at once; of ten datagrams, the last two are not among four."""
+    with closing(Live("sensor", [scenario(content)] * 10)) as live:
+        live.peer.connect(live.address)
+        datagrams = [bytearray(live.encoder.encode(message)) for message in measurements(1, 10)]
+        datagrams[forged][-1 - forged] ^= 1
+        head = [(socket.IPPROTO_UDP, UDP_SEGMENT, struct.pack("=H", DATAGRAM_BYTES))]
+        live.peer.sendmsg([b"".join(datagrams)], head)
+        live.drive_until_accepted(9)
+        assert live.driver.rejected[Rejection.TAG] == 1
+        loops = [row[0] for row in live.rows.tables[SENSOR_MEASUREMENT]]
+        assert loops == [loop for loop in range(10) if loop != forged]
+
+
+@pytest.mark.sanitized
 def test_messages_of_loops_that_tick_together_are_sent_together(content: dict[str, Any]) -> None:
     with closing(Live("plant", [scenario(content)] * 50, since_ns=HOUR_NS)) as live:
         live.peer.setsockopt(socket.IPPROTO_UDP, UDP_GRO, 1)
         live.drive(lambda: live.driver.core.sent >= 500)
-        sizes = [len(datagram) for datagram in received(live.peer, 65_536)]
-        assert max(sizes) == 64 * DATAGRAM_BYTES
-        assert sum(sizes) == live.driver.core.sent * DATAGRAM_BYTES
+        parts = received(live.peer, 65_536)
+        assert max(map(len, parts)) == 64 * DATAGRAM_BYTES
+        assert sum(map(len, parts)) == live.driver.core.sent * DATAGRAM_BYTES
+        for datagram in np.frombuffer(b"".join(parts), np.uint8).reshape(-1, DATAGRAM_BYTES):
+            tag = blake2b(datagram[:-TAG_BYTES], digest_size=TAG_BYTES, key=KEY).digest()
+            assert bytes(datagram[-TAG_BYTES:]) == tag
 
 
 @pytest.mark.sanitized
