@@ -9,7 +9,7 @@ So ric is monotone where C P Cᵀ + R is positive definite: a lower and an upper
 each step, enclose P. If ric(P̄ + X) ≤ P̄ + X and ric(P̄ − X) ≥ P̄ − X, all later P are between both.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 from flint import arb, arb_mat
@@ -83,11 +83,8 @@ class KalmanFilter:
             within = _between(low, high)
             if found and self._change(middle := ((low + high) / 2).mid()) < limit:
                 limit *= _NEXT_TRY
-                for X in self._invariant(middle):
-                    if is_positive(middle + X - high) and is_positive(low - middle + X):
-                        last = self._rounded(_between(middle - X, middle + X), _CONSTANT)
-                        if last is not None:
-                            return (*found, last)
+                if (last := self._later(middle, low, high)) is not None:
+                    return (*found, last)
             gain = self._rounded(within, ROUNDED)
             if gain is None:
                 break
@@ -131,10 +128,13 @@ class KalmanFilter:
         return _symmetric(self._step.flow * corrected * transpose(self._step.flow) + self._step.added)
 
     def _enclosed(self, P: arb_mat, sign: int) -> arb_mat:
-        """Return an exact matrix below (sign −1) or above ric(P): of its errors, rows have sums of radii."""
+        """Return an exact matrix below (sign −1) or above ric(P), by the sums of the radii of its rows."""
         following = self._riccati(P)
-        middle, radii = following.mid(), [sum((x.rad() for x in row), arb(0)) for row in following.tolist()]
-        return (middle + 2 * sign * _diagonal(radii)).mid()
+        enclosed = following.mid()
+        for i, row in enumerate(following.tolist()):
+            moved = enclosed[i, i] + sign * sum((entry.rad() for entry in row), arb(0))
+            enclosed[i, i] = moved.upper() if sign > 0 else moved.lower()
+        return enclosed
 
     def _change(self, P: arb_mat) -> arb:
         """Return by which share of it P changes in a step."""
@@ -143,19 +143,30 @@ class KalmanFilter:
         shares = [abs(change[i, j]) / (size[i] * size[j]).sqrt() for i in rows for j in rows]
         return max(shares, key=float)
 
-    def _invariant(self, P: arb_mat) -> Iterator[arb_mat]:
-        """Yield an X for which ric keeps P̄ ± X within it; nothing if none is found."""
+    def _later(self, P: arb_mat, low: arb_mat, high: arb_mat) -> arb_mat | None:
+        """Return L at all later measurements, if ric keeps P from P̄ − X to P̄ + X, and it is there now."""
+        X = self._proposed(P)
+        try:
+            is_kept = (
+                all(entry.is_finite() for entry in X.entries())
+                and is_positive(P + X - high)
+                and is_positive(low - P + X)
+                and is_positive(P + X - self._riccati(P + X))
+                and is_positive(self._riccati(P - X) - P + X)
+            )
+            return self._rounded(_between(P - X, P + X), _CONSTANT) if is_kept else None
+        except RefusedError:  # X is too large
+            return None
+
+    def _proposed(self, P: arb_mat) -> arb_mat:
+        """Return Σ Fⁱ D Fⁱᵀ, where D is as large as the change of P; F is what ric multiplies changes by."""
         gain, _ = self._gain(P)
         F = (self._step.flow * (identity(self._n) - gain * self._C)).mid()
         share = 4 * self._n * self._change(P) + _LEAST
         X = share * _diagonal(_sizes(P))
-        for _ in range(_MOST_DOUBLINGS):  # Σ Fⁱ X Fⁱᵀ
+        for _ in range(_MOST_DOUBLINGS):
             X, F = (X + F * X * transpose(F)).mid(), (F * F).mid()
-        if not all(entry.is_finite() for entry in X.entries()):
-            return
-        X = _symmetric(X).mid()
-        if is_positive(P + X - self._riccati(P + X)) and is_positive(self._riccati(P - X) - P + X):
-            yield X
+        return _symmetric(X).mid()
 
 
 def _between(low: arb_mat, high: arb_mat) -> arb_mat:

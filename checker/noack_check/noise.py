@@ -32,6 +32,8 @@ _CELLS, _MOST_CELLS = 100, 16
 """Parts of the time 1/‖A‖, and most parts of the time between two measurements."""
 _LITTLE = 0.01
 """A decaying bound below such a share of the constant one is added to it."""
+_MOST_ENTRIES = 50_000_000
+"""Of terms that are added: half a minute."""
 _LATELY = 8
 """So many errors are kept, with their bounds, as they do not depend on r."""
 
@@ -168,6 +170,10 @@ def _sums_by_test(factors: Sequence[arb_mat], sources: Sequence[arb_mat]) -> lis
     some k, all but the last terms are a small share of an earlier sum, see :func:`_length`.
     """
     n, last = factors[0].nrows(), factors[-1]
+    length = _length(last)
+    columns = max(S.ncols() for S in sources)
+    if len(factors) * (len(factors) + length) * n * columns > _MOST_ENTRIES:
+        raise RejectedError("observer: its gains change for too long")
     after, terms = sources[0], [sources[0]]
     found = [_sums(terms, n)]
     for k, factor in enumerate(factors, 1):
@@ -175,7 +181,7 @@ def _sums_by_test(factors: Sequence[arb_mat], sources: Sequence[arb_mat]) -> lis
         terms = [*(factor * term for term in terms), after]
         found.append(_sums(terms, n))
     total = [arb(0)] * n
-    for _ in range(_length(last)):
+    for _ in range(length):
         terms = [last * term for term in terms]
         total = [a + b for a, b in zip(total, _sums([after], n), strict=True)]
         after = last * after

@@ -151,6 +151,17 @@ def test_bounds_do_not_decay_faster_than_the_error(rate: float) -> None:
         noise_of(LOOP, RATE, slow)
 
 
+def test_gains_that_change_for_too_long_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("noack_check.noise._MOST_ENTRIES", 1000)
+    with pytest.raises(RejectedError, match="change for too long"):
+        noise_of(filtered(PUSHED), RATE)
+
+
+def test_gains_of_which_little_is_known_are_rejected() -> None:
+    with pytest.raises(RejectedError, match="not known well enough"):
+        noise_of(filtered(PUSHED, 0.1), RATE)
+
+
 def test_an_observer_that_does_not_decay_is_rejected() -> None:
     assert LOOP.observer is not None
     useless = LOOP._replace(observer=LOOP.observer._replace(gains=(zeros(2, 1),)))
