@@ -4,7 +4,7 @@ import copy
 import json
 from collections.abc import Mapping, Sequence
 from itertools import product
-from math import gcd, lcm
+from math import lcm
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.growth import enclose_growth
 from noack_check.__main__ import check_file
 from noack_check.check import RejectedError
-from noack_check.growth import Burst, PeriodicLoop, prove_growth, read_periodic_loop
+from noack_check.growth import PeriodicLoop, prove_growth, read_periodic_loop
 from noack_check.keys import RefusedError
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import shipped
@@ -27,7 +27,7 @@ from tests.helpers.shipped import shipped
 pytestmark = pytest.mark.usefixtures("nothing_was_found_before")
 
 PERIODIC = "trigger={policy='periodic', period_s=0.1}"
-LONGEST = 9
+LONGEST = 7
 """Of the patterns that are played."""
 
 
@@ -50,8 +50,8 @@ def test_a_set_point_does_not_change_the_growth() -> None:
     at_rest = matrices(periodic("lane_periodic"))
     for content in (resolved.content(), resolved_content(resolved)):
         np.testing.assert_array_equal(matrices(read_periodic_loop(content)), at_rest)
-    words = ("margin", "lane_periodic", "--no-period", "--most", "2")
-    moved = invoke(*words, "--set", "controller.setpoint=[0, 0, 0, 3.5]")
+    words = ("margin", "double_integrator", "--set", PERIODIC, "--no-period", "--most", "2")
+    moved = invoke(*words, "--set", "controller.setpoint=[2, 0]")
     assert moved.stdout == invoke(*words).stdout
 
 
@@ -91,36 +91,6 @@ def allows(loop: PeriodicLoop, outcomes: str) -> bool:
         for most, window in rules
         for begin in range(len(outcomes))
     )
-
-
-@pytest.mark.parametrize(
-    ("name", "settings"),
-    [
-        ("lane_periodic", ()),
-        ("lane_periodic", ("mode=zoh", delayed(0.6))),
-        ("double_integrator", (PERIODIC, "controller.rate_hz=40", "controller.phase=0.3")),
-        ("double_integrator", (PERIODIC, "controller.rate_hz=16", delayed(0.07))),
-        ("double_integrator", (PERIODIC, "controller.phase=0", delayed(0.2))),
-        ("double_integrator", (PERIODIC, "controller.rate_hz=16", "controller.phase=0", delayed(0.27))),
-    ],
-)
-def test_the_matrices_are_those_of_noack(name: str, settings: Sequence[str]) -> None:
-    """Traces of products are the same in all coordinates."""
-    loop = periodic(name, *settings)
-    delivered, lost = matrices(loop)
-    slots, times = loop.times.slots, loop.times
-    for slot, counts in product(range(slots), product(range(3), repeat=3)):
-        bursts = [count + 1 for count in counts]
-        repeats = slots // gcd(slots, sum(bursts))
-        ours, theirs = np.eye(loop.size), np.eye(len(lost[0]))
-        now, before = slot, bursts[-1]
-        for units in bursts * repeats:
-            burst = Burst(0, 0, now % slots, times.usable(before), units - 1, units)
-            ours = floats(loop.matrix(burst)) @ ours
-            for k in range(units):
-                theirs = (lost if k else delivered)[(now + k) % slots] @ theirs
-            now, before = now + units, units
-        assert np.trace(ours) == pytest.approx(np.trace(theirs), rel=1e-10, abs=1e-10)
 
 
 def accepted(loop: PeriodicLoop) -> tuple[dict[str, object], float]:
@@ -201,7 +171,7 @@ def changed_document(document: Mapping[str, object], rng: np.random.Generator) -
     return changed
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.system) for seed in range(1, 9))])
 def test_what_is_accepted_of_changed_witnesses_is_true(seed: int) -> None:
     rng = np.random.default_rng(seed)
     resolved = scenario(*SMALL)
@@ -302,10 +272,11 @@ def test_an_observer_that_learns_nothing_is_not_called_stable() -> None:
 
 def test_the_command_writes_what_noack_check_proves(tmp_path: Path) -> None:
     path = tmp_path / "growth.json"
-    result = invoke("margin", "lane_periodic", "--no-period", "--witness", str(path))
+    words = ("unstable_pendulum", "--set", PERIODIC, "--set", "mode=zoh", "--no-period")
+    result = invoke("margin", *words, "--witness", str(path))
     assert result.stdout.count("proved by noack-check: with") == 2
     lines = list(check_file(json.loads(path.read_text()), None))
-    start = "PROVED lane_periodic, its plant, its schedule, nothing late: "
+    start = "PROVED unstable_pendulum, its plant, its schedule, nothing late: "
     assert [line.startswith(start) for line in lines] == [True, True]
     file = json.loads(path.read_text())
     file["statements"][0]["plants"] = "box"

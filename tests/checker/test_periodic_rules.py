@@ -131,15 +131,6 @@ def test_a_form_at_another_node_is_rejected(found: tuple[Loop, Witness]) -> None
         prove(loop, document)
 
 
-def test_no_form_may_be_missing(found: tuple[Loop, Witness]) -> None:
-    loop, witness = found
-    for name in list(witness.document["bounds"][0]["matrices"])[::4]:  # type: ignore[index]
-        document: Any = copy.deepcopy(dict(witness.document))
-        del document["bounds"][0]["matrices"][name]
-        with pytest.raises(RejectedError, match="missing"):
-            prove(loop, document)
-
-
 # The model.
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from flint import arb, fmpq
-from scipy.linalg import solve_continuous_lyapunov
 
 from noack.theory.witnesses.documents import Witness, find_witness
 from noack_check.balls import beside, identity, matrix, number, zeros
@@ -25,7 +24,6 @@ from tests.checker.test_mutations import DOCUMENTS
 from tests.checker.test_mutations import LOOPS as OTHER_LOOPS
 from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
 from tests.helpers.resolved_tables import resolved_tables
-from tests.oracles.trigger_rules import Trigger
 
 T = fmpq(1, 100)
 DYNAMIC = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5, "eta_0": 0.1}
@@ -92,45 +90,6 @@ def test_runs_come_near_the_bounds(name: str, share: float) -> None:
     )
     smaller = witness.proof._replace(bounds=bounds)
     assert any(exceeded(loop, smaller, rng, 4.0) for _ in range(6))
-
-
-@pytest.mark.parametrize("name", ["double_integrator", "unstable_pendulum"])
-def test_the_memory_is_that_of_the_reference(name: str) -> None:
-    """Sides of the comparison at random measurements, some of which are events."""
-    loop, rng = read(name, DYNAMIC), np.random.default_rng(2)
-    K, memory, step_s = floats(loop.gain), loop.rule.memory, 0.01
-    assert memory is not None
-    BK = floats(loop.model_B) @ K
-    reference = Trigger(DYNAMIC, floats(loop.model_A) + BK, BK)
-    P, N, gain = floats(loop.rule.positive), floats(loop.rule.negative), floats(memory.gain)
-    decay, eta, rate, t_ns = float(memory.decay), float(memory.start), 0.0, 0
-    for step in range(12):
-        x, e = rng.normal(size=(2, 2)) if step else (rng.normal(size=2), np.zeros(2))
-        seen = np.concatenate([x, K @ e])
-        gained_s = -np.expm1(-decay * step_s) / decay
-        if step:
-            t_ns += 10_000_000
-            eta = np.exp(-decay * step_s) * eta + gained_s * rate
-        reference.measured(t_ns, x, e)
-        if step:
-            left, right = reference.sides(t_ns, x, e)
-            difference = np.sum((P @ seen) ** 2) - np.sum((N @ seen) ** 2) - max(eta, 0.0)
-            assert difference == pytest.approx(left**2 - right**2, rel=1e-9, abs=1e-9)
-        rate = float(seen @ gain @ seen)
-        if step % 3 == 0:
-            reference.event(t_ns, x)
-            reference.measured(t_ns, x, 0 * e)
-            rate = float(x @ gain[:2, :2] @ x)
-
-
-def test_the_lyapunov_function_is_that_of_scipy() -> None:
-    loop = read("unstable_pendulum", DYNAMIC)
-    B, K = floats(loop.model_B), floats(loop.gain)
-    F = floats(loop.model_A) + B @ K
-    assert loop.rule.memory is not None
-    gain = floats(loop.rule.memory.gain)
-    assert gain[:2, :2] == pytest.approx(0.5 * np.eye(2))
-    assert gain[:2, 2:] == pytest.approx(-solve_continuous_lyapunov(F.T, -np.eye(2)) @ B, rel=1e-9)
 
 
 # Where updates are at the tests.
@@ -270,15 +229,6 @@ def test_a_negative_coefficient_of_the_memory_is_rejected() -> None:
         prove(loop, document)
 
 
-def test_no_form_may_be_missing() -> None:
-    loop, witness = base("dwell")
-    for name in witness.document["bounds"][0]["matrices"]:  # type: ignore[index]
-        document: Any = copy.deepcopy(dict(witness.document))
-        del document["bounds"][0]["matrices"][name]
-        with pytest.raises(RejectedError, match="missing"):
-            prove(loop, document)
-
-
 def test_the_error_has_no_bound_where_the_model_has_only_its_input() -> None:
     loop, witness = base("switching")
     document: Any = copy.deepcopy(dict(witness.document))
@@ -352,22 +302,6 @@ def test_what_is_accepted_of_changed_witnesses_is_true(name: str, change: str) -
 
 
 # From scenarios.
-
-
-def test_times_of_combined_rules() -> None:
-    """Tests are every 2 ms: a dwell time ends at the first one from it on."""
-    absolute = {"policy": "absolute", "delta": 0.1}
-    loop = read("double_integrator", {"policy": "dwell", "interval_s": 0.0991, "rule": absolute})
-    assert loop.times.dwell == fmpq(1, 10)
-    assert not loop.rule.always
-    within = {
-        "policy": "dwell",
-        "interval_s": 0.3,
-        "rule": {"policy": "deadline", "interval_s": 1.0, "rule": absolute},
-    }
-    loop = read("double_integrator", within)
-    assert loop.rule.always
-    assert loop.times.dwell == fmpq(3, 10)
 
 
 DUE = {

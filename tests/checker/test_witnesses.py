@@ -117,37 +117,6 @@ def test_a_loop_that_does_not_decay_has_no_witness() -> None:
         find_witness(loop._replace(gain=loop.gain * -1))
 
 
-def test_random_runs_stay_below_the_bounds(witness: Witness) -> None:
-    """Runs of the loop at its tests, with exact steps, random losses, delays and ages."""
-    rng = np.random.default_rng(1)
-    sizes = bounds_of(witness)
-    largest = max(_run(rng) for _ in range(20))
-    assert largest <= sizes["x"]
-
-
-def _run(rng: np.random.Generator) -> float:
-    A, B, K = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [0.9]]), np.array([[-1.0, -1.4]])
-    H = A + np.array([[0.0], [1.0]]) @ K
-    dt, x = 0.001, np.array([1.0, 0.0])
-    xs, xc, u, arriving, lost, largest = x.copy(), None, np.zeros(1), None, 0, 1.0
-    for step in range(8000):
-        if step % 10 == 0 and (step == 0 or np.linalg.norm(xs - x) > 0.05 * math.exp(-0.3 * step * dt)):
-            xs = x.copy()
-            drop = step > 0 and lost < 2 and rng.random() < 0.7
-            lost = lost + 1 if drop else 0
-            if not drop:
-                arriving = (step + int(rng.integers(0, 11)), x.copy())
-        if arriving is not None and step >= arriving[0]:
-            xc, arriving = arriving[1], None  # without its propagation: older, at most by 10 ms
-        if step % 10 == 0 and xc is not None:
-            u = K @ xc
-        x = x + dt * (A @ x + B @ u)
-        xs = xs + dt * (H @ xs)
-        xc = None if xc is None else xc + dt * (H @ xc)
-        largest = max(largest, float(np.linalg.norm(x)))
-    return largest
-
-
 def holding(level: float = 0.0, floor: float = 0.02) -> Loop:
     return double_integrator(IDEAL, level=level, floor=floor)._replace(holds=True)
 

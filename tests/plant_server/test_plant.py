@@ -2,44 +2,15 @@
 whole runs in tests/cosim/simulation/test_whole_loop.py."""
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
 from cosim.analysis.ideal_loop import ideal_loop_part
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.run_record import RunRecord
-from noack.protocol.roles import Notice, Record
-from noack.protocol.wire_format import Flow, Message
-from noack.scenario.resolution import resolve, tables_of
-from noack.scenario.scenario_file import validate
 from tests.cosim.simulation.outage import CASES, POLICIES, at_the_end, with_outage
-from tests.helpers.machine_parts import plant_of
 from tests.helpers.shipped import resolved
-
-MS = 1_000_000
-
-
-@pytest.mark.parametrize(("policy", "then"), [("hold", 2.0), ("zero", 0.0)])
-@pytest.mark.parametrize(("sent_ns", "trips"), [(10 * MS, False), (10 * MS - 1, True)])
-def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout(
-    content: dict[str, Any], policy: str, then: float, sent_ns: int, *, trips: bool
-) -> None:
-    watchdog = {"policy": policy, "timeout_s": 0.05}
-    content["plant"] |= {"rate_hz": 100.0, "watchdog": watchdog}
-    scenario = resolve(validate(content, "test"))
-    plant, outputs = plant_of(scenario), []
-    plant.handle(Message(Flow.ACTUATION, 0, sent_ns, np.array([2.0])), sent_ns)
-    for t_ns in range(0, 70 * MS, 10 * MS):
-        outputs += plant.on_timer(t_ns)
-    rows = [output.row for output in outputs if isinstance(output, Record)]
-    u = np.array(rows, tables_of(scenario)["plant_step"])["u"][:, 0]
-    assert (u[5], u[6]) == (2.0, then if trips else 2.0)
-    notices = [(output.t_ns, output.level) for output in outputs if isinstance(output, Notice)]
-    assert notices == [(60 * MS, "watchdog")] * trips
-
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -11,14 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy.integrate import solve_ivp
-from scipy.linalg import expm, solve_continuous_lyapunov
+from scipy.linalg import expm
 
+from noack.core.core_library import core, ffi
 from noack.core.linear_systems import (
     Matrix,
     Propagator,
     balancing_exponents,
-    discretise,
     exponential,
     norm,
     product,
@@ -32,27 +31,6 @@ def square(n: int) -> st.SearchStrategy[Matrix]:
 
 
 generators = st.integers(1, 5).flatmap(square)
-
-
-@st.composite
-def systems(draw: st.DrawFn) -> tuple[Matrix, Matrix]:
-    n, m = draw(st.integers(1, 5)), draw(st.integers(1, 3))
-    return draw(square(n)), draw(arrays(np.float64, (n, m), elements=st.floats(-1, 1)))
-
-
-@given(systems(), st.integers(1, 500_000_000), st.integers(0, 2**32))
-def test_a_held_input_gives_what_an_integrator_gives(
-    system: tuple[Matrix, Matrix], dt_ns: int, seed: int
-) -> None:
-    A, B = system
-    x0, u = np.split(np.random.default_rng(seed).uniform(-1, 1, sum(B.shape)), [len(A)])
-    Ad, Bd = discretise(A, B, dt_ns)
-    solution = solve_ivp(
-        lambda t, x: A @ x + B @ u, (0.0, dt_ns * 1e-9), x0,
-        method="DOP853", rtol=1e-12, atol=1e-12,
-    )  # fmt: skip
-    # The integrator's local errors of 1e-12 grow by at most e^{‖A‖ dt} ≤ e^2.5 over its few steps.
-    np.testing.assert_allclose(Ad @ x0 + Bd @ u, solution.y[:, -1], atol=1e-9)
 
 
 @given(generators, st.lists(st.integers(1, 10**9), min_size=1, max_size=5))
@@ -102,6 +80,14 @@ def test_a_product_rounds_each_term_and_then_each_sum_from_the_left(p: int, n: i
     assert product(matrix, vector).tolist() == by_hand
 
 
+@given(st.floats(-1e6, 1e6))
+def test_sine_and_cosine_are_those_of_numpy(turns: float) -> None:
+    parts = ffi.new("double[2]")
+    core.noack_sine_and_cosine(turns, parts)
+    angle = 2 * np.pi * float(np.remainder(turns, 1.0))
+    assert list(parts) == pytest.approx([np.sin(angle), np.cos(angle)], abs=1e-15)
+
+
 @given(st.lists(st.floats(), min_size=1, max_size=20))
 def test_a_norm_is_the_hypotenuse(values: list[float]) -> None:
     # About 20 roundings; numbers below 2⁻¹⁰²² have fewer digits.
@@ -116,16 +102,6 @@ def test_the_exponential_is_that_of_scipy(n: int, scale: float) -> None:
     expected = expm(matrix)
     error = np.linalg.norm(exponential(matrix) - expected)
     assert error <= 1e-13 * max(scale, 1) * np.linalg.norm(expected)
-
-
-@pytest.mark.parametrize("n", [1, 2, 5, 14])
-def test_lyapunov_equations_are_solved(n: int) -> None:
-    rng = np.random.default_rng(n)
-    M = rng.uniform(-1, 1, (n, n)) - 3 * np.eye(n)
-    Q = rng.uniform(-1, 1, (n, n))
-    solution = solve_lyapunov(M, Q)
-    assert M @ solution + solution @ M.T == pytest.approx(Q, abs=1e-12)
-    assert solution == pytest.approx(solve_continuous_lyapunov(M, Q), abs=1e-12)
 
 
 def test_a_lyapunov_equation_without_a_solution_is_an_error() -> None:

@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 
 from cosim.analysis.replay import replay
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.core.errors import CallerError
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.loads import load_gains
 from noack.scenario.resolution import loop_of, resolve, resolve_run, setpoint_of
@@ -95,56 +93,6 @@ def test_without_the_load_in_the_model_the_offset_stays_and_packets_never_cease(
     assert abs(last_x(with_load, 2)[0]) < 0.02
     events = [int((run[SENSOR_MEASUREMENT]["event"] >= 0).sum()) for run in (without, with_load)]
     assert events[1] < events[0] / 4
-
-
-def test_the_plant_follows_its_differential_equation_under_the_recorded_inputs() -> None:
-    run = simulate(resolve(mass(model={"load": "input"}, plant={"load": [0.5]})))
-    rows = run[PLANT_STEP]
-
-    def rates(t_s: float, x: Vector) -> list[float]:
-        return [x[1], rows["u"][min(int(t_s * 100 + 1e-6), len(rows) - 1)][0] + 0.5]
-
-    x = np.array([1.0, 0.0])
-    for number in range(300):
-        solved = solve_ivp(rates, (number / 100 + 1e-9, (number + 1) / 100 - 1e-9), x, rtol=1e-10, atol=1e-12)
-        x = solved.y[:, -1]
-    np.testing.assert_allclose(rows["x"][300][:2], x, atol=1e-6)
-
-
-def observed(rows: np.ndarray, A: Matrix, B: Matrix, L: Matrix, first: Matrix, C: Matrix) -> Matrix:
-    """Return x̂ after each measurement, by the observer's definition."""
-    n, m = B.shape
-    both = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * 0.01)
-    estimates, x = [], np.zeros(n)
-    for number, row in enumerate(rows):
-        if number:
-            x = both[:n, :n] @ x + both[:n, n:] @ row["u_applied"]
-        x = x + (L if number else first) @ (row["y"] - C @ x)
-        estimates.append(x)
-    return np.array(estimates)
-
-
-@pytest.mark.parametrize("C", [None, [[1.0, 0.0]]])
-def test_the_sensor_estimates_the_load_from_all_states_and_from_one(C: list[list[float]] | None) -> None:
-    measurement = {} if C is None else {"C": C}
-    run = simulate(resolve(mass(model={"load": "input"}, plant={"load": [0.5], "measurement": measurement})))
-    observer, rows = run.scenario.observer, run[SENSOR_MEASUREMENT]
-    A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
-    matrix = np.hstack([np.eye(2) if C is None else np.array(C), np.zeros((2 if C is None else 1, 1))])
-    expected = observed(
-        rows,
-        A,
-        np.array([[0.0], [1.0], [0.0]]),
-        np.array(observer.gain),
-        np.array(observer.first_gain),
-        matrix,
-    )
-    np.testing.assert_allclose(rows["x"], expected, atol=1e-9)
-    assert rows["x"][0][2] == 0.0  # what is measured first is no load
-    assert rows["x"][-1][2] == pytest.approx(0.5, abs=1e-6)
-    # 4 times faster than the slowest pole of the closed loop, −0.75 ± 0.66j
-    after = rows["x"][100:200:100, 2] - 0.5
-    assert abs(after[0]) < 2 * 0.5 * np.exp(-3.0 * 1.0) + 0.3 * (C is not None)
 
 
 def test_what_sensor_and_controller_know_at_the_start_has_no_load() -> None:

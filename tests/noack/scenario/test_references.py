@@ -9,7 +9,6 @@ from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
 from noack.core.references import Reference
-from noack.references.piece_settings import OutputSignal, joining
 from noack.scenario.resolution import loop_of, reference_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
@@ -102,19 +101,6 @@ def test_a_joined_piece_begins_and_ends_without_a_jump(tmp_path: Path) -> None:
     plain = followed(tmp_path, piece("sine", 1.0, "amplitude = 1.0, hz = 0.5"))
     assert reference.state(3 * S) == pytest.approx(plain.state(3 * S), abs=1e-9)
     assert reference.state(6 * S) == pytest.approx([3.0, 0.0], abs=1e-12)
-
-
-def test_a_signal_moved_in_time_is_the_same_signal() -> None:
-    signal = OutputSignal(np.array([1.0, -2.0, 0.5]), 0.7, 0.3, -0.4)
-    for t_s in (0.0, 0.4, 3.0):
-        assert signal.from_time(1.3).derivatives(t_s, 4) == pytest.approx(signal.derivatives(t_s + 1.3, 4))
-
-
-def test_the_joining_polynomial_has_the_derivatives_of_both_ends() -> None:
-    start, end = np.array([1.0, -1.0, 2.0]), np.array([0.5, 3.0, 0.0])
-    join = joining(start, end, 0.3)
-    assert join.derivatives(0.0, 3) == pytest.approx(start)
-    assert join.derivatives(0.3, 3) == pytest.approx(end)
 
 
 def test_where_the_plant_integrates_an_output_its_position_moves_on(tmp_path: Path) -> None:

@@ -85,26 +85,6 @@ def test_any_losses_are_counted_exactly(seed: int) -> None:
     assert np.flatnonzero(trace_of(file, size_bytes).lost).tolist() == lost_of(packets)
 
 
-@pytest.mark.parametrize("waited", [30, 200, 1000])
-def test_packets_that_wait_in_a_queue_are_not_taken_for_lost_ones(waited: int) -> None:
-    t_ns = T_NS + np.arange(4000) * PERIOD_NS
-    t_ns[1000 : 1000 + waited] = t_ns[1000 + waited] - np.arange(waited, 0, -1)
-    number = (np.arange(4000) % 256).astype(np.uint64)
-    assert find_packets(number, t_ns, 8).packet.tolist() == list(range(4000))
-
-
-@pytest.mark.parametrize("bits", [8, 16, 32])
-def test_losses_while_a_queue_empties_are_no_restart(bits: int) -> None:
-    number = np.arange(6000)
-    t_ns = T_NS + number * 5 * 10**6
-    t_ns[3000:3900] = t_ns[3900] - np.arange(900, 0, -1)  # 4.5 s of packets arrive at once
-    keep = np.ones(6000, bool)
-    keep[3200:3212] = keep[3600:3611] = False
-    arrivals = find_packets((number % 2**bits).astype(np.uint64)[keep], t_ns[keep], bits)
-    assert arrivals.packet.tolist() == number[keep].tolist()
-    assert not arrivals.part.any()
-
-
 @pytest.mark.parametrize("bits", [8, 16, 32])
 @pytest.mark.parametrize(
     ("largest", "jitter_ns"), [(40, 0), (40, 900_000), (9, 20_000_000), (4, 3_000_000), (200, 1_000_000)]
