@@ -32,8 +32,6 @@ _NEGLIGIBLE = 1e-140
 """Smaller entries have no influence when a matrix is balanced."""
 _MOST_ROUNDS, _LARGEST_EXPONENT = 20, 200
 """Most rounds of balancing, and the largest exponent."""
-_MOST_STATES = 12
-"""The linear equations of a Lyapunov equation grow with the fourth power of the states."""
 
 
 def exponential(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -185,23 +183,3 @@ def balancing_exponents(sizes: Matrix) -> NDArray[np.int64]:
 
 def _reals(values: Matrix | Vector) -> CData:
     return ffi.from_buffer("double[]", np.ascontiguousarray(values, np.float64))
-
-
-def solve_lyapunov(M: Matrix, Q: Matrix) -> Matrix:
-    """Return X with M X + X Mᵀ = Q, for matrices or stacks of them, (…, n, n).
-
-    Raises:
-        numpy.linalg.LinAlgError: one of them has no unique solution.
-    """
-    *lead, n, _ = M.shape
-    if n > _MOST_STATES:
-        from scipy.linalg import solve_continuous_lyapunov  # slow to import
-
-        if lead:
-            return np.array([solve_lyapunov(matrix, Q) for matrix in M])
-        return np.asarray(solve_continuous_lyapunov(M, Q))
-    identity = np.eye(n)
-    left = M[..., :, None, :, None] * identity[:, None, :]
-    right = identity[:, None, :, None] * M[..., None, :, None, :]
-    equations = (left + right).reshape(*lead, n * n, n * n)
-    return np.asarray(np.linalg.solve(equations, Q.reshape(n * n, 1)).reshape(M.shape))

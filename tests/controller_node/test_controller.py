@@ -2,8 +2,9 @@
 
 Its model, inputs and predictions are compared with a reference loop in
 tests/cosim/simulation/test_whole_loop.py, changes during a run are in
-tests/cosim/record/test_recorded_changes.py, users' control laws in tests/noack/controllers/. Updates that are older than the newest one do not reach the controller:
-the receiver rejects them (tests/noack/protocol/test_wire_format.py).
+tests/cosim/record/test_recorded_changes.py, users' control laws in tests/noack/controllers/.
+Updates that are older than the newest one do not reach the controller: the receiver rejects them
+(tests/noack/protocol/test_wire_format.py).
 """
 
 from collections.abc import Sequence

@@ -21,7 +21,6 @@ from noack.core.linear_systems import (
     exponential,
     norm,
     product,
-    solve_lyapunov,
     transition,
 )
 
@@ -102,8 +101,3 @@ def test_the_exponential_is_that_of_scipy(n: int, scale: float) -> None:
     expected = expm(matrix)
     error = np.linalg.norm(exponential(matrix) - expected)
     assert error <= 1e-13 * max(scale, 1) * np.linalg.norm(expected)
-
-
-def test_a_lyapunov_equation_without_a_solution_is_an_error() -> None:
-    with pytest.raises(np.linalg.LinAlgError):
-        solve_lyapunov(np.diag([1.0, -1.0]), np.eye(2))
