@@ -57,7 +57,7 @@ def shorter(words: list[str]) -> list[str]:
     return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
 
 
-@pytest.mark.usefixtures("without_viewer", "no_drawing")
+@pytest.mark.usefixtures("without_viewer", "no_drawing", "short_searches")
 @pytest.mark.parametrize("command", sorted(set(commands())))
 def test_every_command_works(command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program, *words = shlex.split(command.partition(" > ")[0])

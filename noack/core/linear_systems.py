@@ -1,13 +1,10 @@
-"""Linear time-invariant systems: exact propagation, exponentials, norms, Lyapunov equations.
+"""Linear time-invariant systems: exact propagation, exponentials, norms.
 
 Time steps are integer nanoseconds; matrices are per second. The same step always gives the same
 matrix, bit for bit, whether it was cached or not, and on every processor. A library's matrix
 exponential depends on the processor, by the BLAS below it: two hosts of one run, or a run and its
 replay on another machine, would then differ in the last bits of every state. So the core's is used
 (native/loop/exponential.c).
-
-Lyapunov equations are solved in numpy, since importing scipy.linalg takes 0.2 s. They are for
-bounds, which are enlarged by more than the rounding.
 """
 
 import math

@@ -267,6 +267,7 @@ def test_a_saturated_input_is_proven_to_stay_inside_its_limits(
         list(check_file({"scenario": content, "statements": [less]}, None))
 
 
+@pytest.mark.system
 def test_no_attack_exceeds_what_is_proven_on_a_region() -> None:
     resolved = resolve(load(SCENARIOS / "sine_pendulum.toml", ["network.mansd=2"]))
     statement = find_statement(resolved, "region", "schedule")

@@ -46,7 +46,7 @@ def found(request: pytest.FixtureRequest) -> tuple[Loop, Witness]:
 def test_runs_stay_below_the_bounds(found: tuple[Loop, Witness]) -> None:
     loop, witness = found
     rng = np.random.default_rng(1)
-    for _ in range(12):
+    for _ in range(6):
         assert exceeded(loop, witness.proof, rng, 6.0) == []
 
 

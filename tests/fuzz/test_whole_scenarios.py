@@ -16,7 +16,10 @@ from tests.fuzz.scenarios.draws import NEVER_DRAWN, draw, drawn_keys, schema_key
 from tests.helpers.shipped import shipped
 
 SEED = 71
-DRAWS = [number for number in range(31) if number not in (18, 20, 26, 27)]
+DRAWS = [
+    pytest.param(number, marks=pytest.mark.system if number > 14 else ())
+    for number in range(31) if number not in (18, 20, 26, 27)
+]  # fmt: skip
 """Draws that are checked; the certificates of the others take long."""
 MANY = 2000
 """Draws that together set every key."""

@@ -104,33 +104,28 @@ def test_certificates_cover_no_disturbance_and_no_policy_of_a_package(tmp_path: 
     ]
 
 
-@pytest.mark.parametrize(
-    ("module", "reason"),
-    [
-        ("class End(BaseException): ...\nraise End('at once')", "End: at once"),
-        ("x = (", "SyntaxError: '(' was never closed (swing_plant.py, line 1)"),
-        ("", "it has nothing for the group noack.plants"),
-        (PLANT.replace("KIND", "linear"), "ValueError: kind = linear exists already"),
-    ],
-)  # fmt: skip
-def test_a_broken_package_costs_one_line(tmp_path: Path, module: str, reason: str) -> None:
-    points = "[noack.plants]\nswing = swing_plant\n[noack.triggers]\nswing = not_there\n"
-    install(tmp_path, "noack-swing", points, swing_plant=module)
+BROKEN = {
+    "end": ("swing_end", "class End(BaseException): ...\nraise End('at once')", "End: at once"),
+    "syntax": ("swing_x", "x = (", "SyntaxError: '(' was never closed (swing_x.py, line 1)"),
+    "nothing": ("swing_nothing", "", "it has nothing for the group noack.plants"),
+    "taken": ("swing_taken", PLANT.replace("KIND", "linear"), "ValueError: kind = linear exists already"),
+    "unnamed": ("not a module !", None, ""),
+}
+"""By package: its module, the text of this, and why it is ignored."""
+
+
+def test_each_broken_package_costs_one_line(tmp_path: Path) -> None:
+    for package, (module, text, _) in BROKEN.items():
+        points = f"[noack.plants]\nswing = {module}\n[noack.triggers]\nswing = not_there\n"
+        modules = {} if text is None else {module: text}
+        install(tmp_path, f"noack-{package}", points, **modules)
     again = "import subprocess, sys; subprocess.run([sys.executable, '-c', sys.argv[1]], check=True)"
     output, warnings = run(tmp_path, "-c", f"{KINDS}; {again}", KINDS)
     assert "swing" not in output
-    (line,) = warnings  # the program that it starts prints no other
-    assert line.startswith(
-        f"noack: warning: a part of the extension noack-swing is ignored: swing_plant: {reason}"
-    )
-    assert run(tmp_path, "-c", KINDS, **{NO_EXTENSIONS: "1"})[1] == []
-
-
-def test_an_entry_point_that_names_no_module_costs_one_line(tmp_path: Path) -> None:
-    install(tmp_path, "noack-swing", "[noack.plants]\nswing = not a module !\n")
-    output, (line,) = run(tmp_path, "-c", KINDS)
-    assert "swing" not in output
-    assert line.startswith("noack: warning: a part of the extension noack-swing is ignored: not a module !: ")
+    # The program that it starts prints no others.
+    for line, (package, (module, _, reason)) in zip(sorted(warnings), sorted(BROKEN.items()), strict=True):
+        start = f"noack: warning: a part of the extension noack-{package} is ignored: {module}: {reason}"
+        assert line.startswith(start)
 
 
 @pytest.mark.parametrize(("words", "package"), [
