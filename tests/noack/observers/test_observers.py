@@ -18,7 +18,7 @@ from cosim.simulation.virtual_time import simulate
 from noack.core.row_operations import row_norms
 from noack.observers.observer_settings import observer_gain, unobservable_mode
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
-from noack.scenario.estimation import steady_state, true_model
+from noack.scenario.estimation import assumed_model, steady_state, true_model
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
@@ -170,6 +170,27 @@ def test_an_unobservable_mode_is_reported_by_its_eigenvalue() -> None:
     assert unobservable_mode(Ad, np.array([[1.0, 0.0, 0.0]])) is None
     assert unobservable_mode(Ad, np.array([[0.0, 1.0, 1.0]])) == 1.5
     assert unobservable_mode(Ad, np.array([[1.0, 1.0, 0.0]]), stable_too=True) == 0.9
+
+
+def test_filter_settings_default_to_the_scenarios_noise_and_disturbances(observed: dict[str, Any]) -> None:
+    observed["plant"]["disturbances"] = [
+        {"kind": "gaussian", "at": "input", "std": [0.3]},
+        {"kind": "uniform", "at": "state", "bound": [0.0, 0.6]},
+        {"kind": "sine", "amplitude": [5.0], "hz": 1.0},
+    ]
+    scenario = resolved(observed)
+    assumed, h = assumed_model(scenario), 0.01
+    into = np.array([h**2 / 2, h])  # of the double integrator with a held input
+    expected = (0.3**2 + 0.6**2 / 3) * np.outer(into, into)
+    np.testing.assert_allclose(assumed.Q, expected, rtol=1e-9)
+    assert assumed.R.tolist() == [[0.02**2]]
+    observed["observer"] = KALMAN | {
+        "process_std": [0.0, 0.0], "input_std": [1.0], "noise_std": [0.5],
+    }  # fmt: skip
+    given = assumed_model(resolved(observed))
+    np.testing.assert_allclose(given.Q, np.outer(into, into), rtol=1e-9)
+    assert given.R.tolist() == [[0.25]]
+    np.testing.assert_allclose(true_model(resolved(observed)).Q, expected, rtol=1e-9)
 
 
 def test_the_scalar_steady_state_solves_the_quadratic_equation(content: dict[str, Any]) -> None:

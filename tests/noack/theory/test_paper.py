@@ -48,7 +48,7 @@ def of(system: System) -> tuple[LoopMatrices, Theorem2]:
     return loop, paper
 
 
-@settings(SEARCH, max_examples=2)
+@settings(SEARCH, max_examples=6)
 @given(systems(weighted=False))
 def test_theorem_2_is_what_its_equations_say(system: System) -> None:
     """Every quantity recomputed from eq:tau, eq:Htil and eq:normXt; F at t_i = 0 and far out."""
