@@ -154,6 +154,7 @@ def set_times(axes: "Axes", t_s: Reals, *, labelled: bool = True) -> None:
     if labelled:
         axes.set_xlabel(TIME)
     else:
+        axes.set_xlabel("")
         axes.tick_params(which="both", labelbottom=False)
 
 

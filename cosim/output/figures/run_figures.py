@@ -77,8 +77,9 @@ BOUNDED = ("outputs", "errors", "state-norm", "inter-event")
 _STATES_NARROWEST_IN, _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN = 1.7, 2.2, 5.0
 """Widths of a panel of these figures, in inches."""
 _MOST_STATES = 16
-_MOST_OUTPUTS, _LEAST_SHOWN = 6, 0.01
-"""Outputs that are drawn; the least distance, as a share of the allowed error."""
+_MOST_OUTPUTS, _LEAST_SHOWN, _RARE = 6, 0.01, 0.01
+"""Outputs that are drawn; the least distance, as a share of the allowed error; without one, the share of
+distances that may be below the axis."""
 _LONGEST_TITLE = 40  # characters
 _DECADES = 6
 """Maximum decades of an axis of norms."""
@@ -364,7 +365,10 @@ def _outputs(record: RunRecord, bounds: Mapping[str, list[Curve]]) -> PageFigure
             title = f"{label_text(output.name)}: distance from its {target}"
             draw_norms(axes, title, curves, bounds[output.name])
             if output.allowed is not None:  # what is far within is of no interest
-                axes.set_ylim(bottom=max(axes.get_ylim()[0], _LEAST_SHOWN * output.allowed))
+                least = _LEAST_SHOWN * output.allowed
+            else:  # nor how near the samples are to the moment at which it is 0
+                least = np.quantile(curves[0].values, _RARE) / 2 if len(curves[0].values) else 0.0
+            axes.set_ylim(bottom=max(axes.get_ylim()[0], least))
             unit = f" [{label_text(output.unit)}]" if output.unit else ""
             axes.set_ylabel(f"distance{unit}")
             set_times(axes, curves[0].t_s, labelled=i == len(drawn) - 1)

@@ -150,6 +150,16 @@ def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: 
     assert states.read_text().count('width="720pt"') == 1
 
 
+def test_outputs_share_the_axis_of_time_and_their_zeros_do_not_stretch_the_others() -> None:
+    """The offset crosses its set-point: a sample is nearer to it than 1e-4 m, by chance."""
+    run = noack.simulate(noack.load("lane_following", {"horizon_s": 10.0, "certificate.prove": False}))
+    axes = run._describe("outputs").draw().axes
+    assert [panel.get_xlabel() for panel in axes] == ["", "time t [s]"]
+    offset, bottom = axes[0].lines[0].get_ydata(), axes[0].get_ylim()[0]
+    assert np.min(offset) < 1e-4 < 1e-3 < bottom
+    assert np.mean(offset < bottom) < 0.02
+
+
 @pytest.mark.parametrize("name", ["servo_reference", "dc_motor_load"])
 def test_the_norm_is_the_distance_that_is_bounded(name: str) -> None:
     """About a reference, or where the loop rests under its load: x itself is at 1.6, and the load at 0.2."""
