@@ -28,7 +28,7 @@ FIGURES = {
 def commands() -> Iterator[str]:
     for page in PAGES:
         for block in blocks(page, "sh"):
-            lines = (line.partition("#")[0].strip() for line in block.splitlines())
+            lines = (line.partition("#")[0].strip() for line in block.replace("\\\n", "").splitlines())
             yield from (line.removeprefix(".venv/bin/") for line in filter(None, lines))
 
 
@@ -54,7 +54,9 @@ SHORTER = {
 def shorter(words: list[str]) -> list[str]:
     more = ("--effort", "5") if "--effort" in words else SHORTER.get(words[0], ())
     more = ("--figure", "errors") if "pdf" in words else more
-    return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
+    if "horizon_s" in " ".join(words) and words[0] != "adversary":
+        more = more[:1]
+    return [*words, *more]
 
 
 @pytest.mark.usefixtures("without_viewer", "no_drawing", "short_searches")

@@ -14,7 +14,7 @@ PAGES = (
     "docs/paper.md", "docs/netem.md", "docs/netem-programs.md", "docs/campaigns.md",
     "docs/design.md", "docs/plants.md", "docs/library.md", "docs/command-line.md", "docs/howto.md",
     "docs/guarantees.md", "docs/benchmarks.md", "docs/measure.md", "docs/choosing-m.md",
-    "docs/papers.md", "docs/published.md",
+    "docs/papers.md", "docs/published.md", "docs/theory.md",
 )  # fmt: skip
 
 
