@@ -42,7 +42,7 @@ SHORTER = {
     "demo": ("--no-report", "--set", "certificate.prove=false"),
     "run": ("--no-report", "--set", "certificate.prove=false"),
     "campaign": ("--workers", "1", "--draws", "10"),
-    "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
+    "adversary": ("--set", "horizon_s=2", "--nodes", "500"),
     "design": ("--draws", "80"),
     "margin": ("--no-period", "--most", "2"),
     "doctor": ("--seconds", "0.1"),

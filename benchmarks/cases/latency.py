@@ -41,9 +41,9 @@ class LatencyCase(NamedTuple):
 
 
 CASES = {
-    "every 2 ms, real-time settings": LatencyCase(0.002, 5.0, _FREQUENT_EVENTS, True, Goal("<=", 1.4)),
-    "every 2 ms, no settings": LatencyCase(0.002, 5.0, _FREQUENT_EVENTS, False, Goal("<=", 1.3)),
-    "every 0.5 s, real-time settings": LatencyCase(0.5, 30.0, _RARE_EVENTS, True, Goal("<=", 1.3)),
+    "every 2 ms, real-time settings": LatencyCase(0.002, 5.0, _FREQUENT_EVENTS, True, Goal("<=", 1.3)),
+    "every 2 ms, no settings": LatencyCase(0.002, 5.0, _FREQUENT_EVENTS, False, Goal("<=", 1.2)),
+    "every 0.5 s, real-time settings": LatencyCase(0.5, 30.0, _RARE_EVENTS, True, Goal("<=", 0.6)),
 }
 
 
@@ -83,7 +83,7 @@ def latency() -> Iterator[Row]:
         note += f"; not applied: {', '.join(sorted(refusals))}" if refusals else ""
         row = partial(rounds.row, unit="µs", ours=OURS, peer=PING)
         yield row(f"event → update, {name}, p50", quantity="p50", goal=case.goal, note=note)
-        yield row(f"event → update, {name}, p99", quantity="p99", goal=Goal("<=", 2))
+        yield row(f"event → update, {name}, p99", quantity="p99", goal=Goal("<=", 1.5))
 
 
 TICK_ROUNDS, ROUND_S = 9, 1
