@@ -177,7 +177,7 @@ def test_the_checker_reads_it_with_an_observer_about_a_reference() -> None:
     assert loop.fault() == ""
     assert loop.until == 12
     assert loop.observer is not None
-    assert not any(entry != 0 for entry in loop.observer.correction.tolist()[2])
+    assert not any(entry != 0 for entry in loop.observer.last_correction.tolist()[2])
 
 
 @pytest.mark.parametrize(
