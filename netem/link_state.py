@@ -119,13 +119,6 @@ class LinkState:
         )
         return decisions
 
-    def leave(self, row: int, packet: int, size_bytes: int, *, delayed: bool, counts: bool) -> bool:
-        """Note that a packet, or a copy, actually leaves; return whether it is stale.
-
-        ``delayed``: it was in flight. ``counts``: it is the packet's first intact copy.
-        """
-        return bool(core.noack_link_leave(self.core, row, packet, size_bytes, delayed, counts))
-
     def change(self, settings: LinkSettings, latest_ns: Integers) -> None:
         """Apply other settings; see native/network/link_change.c.
 

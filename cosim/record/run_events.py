@@ -50,11 +50,6 @@ class RecordedChange(NamedTuple):
         return max(self.since_ns.get(role, NEVER_NS) for role in CHANGEABLE)
 
     @property
-    def late(self) -> dict[str, int]:
-        """Processes that applied it after its time, with their times."""
-        return {role: ns for role, ns in self.since_ns.items() if ns > self.change.t_ns}
-
-    @property
     def touches_claims(self) -> bool:
         """Whether a claim depends on the changed settings."""
         return not is_of_loss_alone(self.change.settings)

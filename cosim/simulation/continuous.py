@@ -110,10 +110,6 @@ class ContinuousLoop:
         norms: Vector = np.linalg.norm(errors if W is None else errors @ W.T, axis=-1)
         return norms
 
-    def sample(self, state: LoopState, t_s: Vector) -> LoopSamples:
-        """Return the states at ascending times ≥ ``state.t_s``, without events in between."""
-        return self.follow(np.array([state.t_s]), np.array(state[1:])[None], t_s)
-
     def follow(self, start_s: Vector, starts: NDArray[np.float64], t_s: Vector) -> LoopSamples:
         """Return the states at ascending times, of parts that begin just after events.
 

@@ -5,7 +5,6 @@ input is added to u after the actuator, where it is not measured. A disturbance 
 ẋ = Ax + Bu + w.
 """
 
-import math
 from abc import abstractmethod
 from typing import ClassVar, Literal, NamedTuple
 
@@ -49,11 +48,6 @@ class DisturbanceSettings(ScenarioSection):
     def variance(self) -> Vector:
         """Variance of the random part of each entry; zeros if the disturbance is not random."""
         return np.zeros(len(self.entries))
-
-    @property
-    def duration_s(self) -> float:
-        """The time from the first value other than 0 to the last one; by default infinite."""
-        return math.inf
 
     def extent(self) -> Matrix:
         """Return columns, (entries, k): the signal is their sum with k factors from −1 to 1."""

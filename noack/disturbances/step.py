@@ -1,6 +1,5 @@
 """A disturbance that is constant while it lasts: a load, a gust of wind."""
 
-import math
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -31,10 +30,6 @@ class StepDisturbance(DisturbanceSettings):
         if self.until_s is not None and self.until_s <= self.from_s:
             raise ValueError("until_s: must be later than from_s")
         return self
-
-    @property
-    def duration_s(self) -> float:
-        return math.inf if self.until_s is None else self.until_s - self.from_s
 
     def extent(self) -> Matrix:
         return np.array(self.amplitude)[:, None]

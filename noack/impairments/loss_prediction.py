@@ -309,22 +309,6 @@ class OutcomeChain(NamedTuple):
         lost[-1, -2] = 1.0
         return OutcomeChain(lost, delivered)
 
-    def recurrent(self) -> "OutcomeChain":
-        """Return the states that occur again and again, in their order.
-
-        Raises:
-            NotPredictableError: which ones these are depends on the beginning.
-        """
-        from scipy.sparse.csgraph import connected_components  # slow to import
-
-        transitions = self.lost + self.delivered > 0
-        _, labels = connected_components(transitions, connection="strong")
-        transient_labels = labels[(transitions & (labels[:, None] != labels)).any(axis=1)]
-        lasting = ~np.isin(labels, transient_labels)
-        if len(set(labels[lasting])) > 1:
-            raise NotPredictableError("the losses depend on what happens at the beginning")
-        return OutcomeChain(self.lost[np.ix_(lasting, lasting)], self.delivered[np.ix_(lasting, lasting)])
-
     def distribution(self, spacing: int = 1) -> Array:
         """Return the mean distribution before the packets 0, ``spacing``, 2 ``spacing``, …, (n,)."""
         transitions = np.linalg.matrix_power(self.lost + self.delivered, spacing)

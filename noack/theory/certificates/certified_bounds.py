@@ -44,10 +44,6 @@ class ScenarioCertificate:
         """Whether there is a bound of a quantity from the start on."""
         return self.proven is not None and quantity in self.proven.bounds
 
-    def without(self, why: str) -> Self:
-        """Return no certificate of the same plants, with the reason."""
-        return replace(self, proven=None, void=why)
-
     def of_output(self, index: int, row: Sequence[float]) -> Self:
         """Return the certificate with the bound of an output, |c x|, in the place of that of ‖x‖.
 

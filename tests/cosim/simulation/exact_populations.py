@@ -192,7 +192,7 @@ def cost_of(run: ContinuousRun, setting: Setting) -> float:
         edges_s = np.linspace(begin_s, end_s, math.ceil((end_s - begin_s) / 0.1) + 1)
         for low_s, high_s in pairwise(edges_s):
             t_s = low_s + (high_s - low_s) * (nodes + 1) / 2
-            samples = run.system.sample(state, t_s)
+            samples = run.system.follow(np.array([state.t_s]), np.array(state[1:])[None], t_s)
             u = samples.x_c @ setting.K.T
             integrand = ((samples.x @ Q) * samples.x).sum(1) + ((u @ R) * u).sum(1)
             total += (high_s - low_s) / 2 * float(weights @ integrand)
@@ -206,7 +206,7 @@ def dense(run: ContinuousRun, setting: Setting) -> tuple[Vector, Vector, Vector]
     times_s, norms, errors = [], [], []
     for state, begin_s, end_s in pieces(run):
         t_s = np.linspace(begin_s, end_s, 400)
-        samples = run.system.sample(state, t_s)
+        samples = run.system.follow(np.array([state.t_s]), np.array(state[1:])[None], t_s)
         times_s.append(t_s)
         norms.append(np.linalg.norm(samples.x, axis=1))
         errors.append(run.e_c_norm(samples) * np.exp(alpha * t_s))

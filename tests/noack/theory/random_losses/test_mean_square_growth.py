@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from noack.impairments.loss_prediction import LossProcess
+from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array, NotPredictableError
 from noack.theory.random_losses.mean_square_growth import PeriodMaps
 from noack.theory.time_triggered.exact_matrices import IntervalMatrix
@@ -55,7 +55,7 @@ def test_a_spectral_radius_that_was_computed_too_small_is_not_accepted(
 @pytest.mark.parametrize("radius", [0.0, 1e-9])
 def test_a_bound_of_the_second_moments_is_proven_with_all_rounding(radius: float) -> None:
     """x becomes ax with |a| ≤ 0.7 + radius, and has another state that nothing moves."""
-    size, chain = 0.7 + radius, unlimited(independent(0.4)).recurrent()
+    size, chain = 0.7 + radius, OutcomeChain(np.array([[0.4]]), np.array([[0.6]]))
     M = IntervalMatrix(np.diag([0.7, 0.0]), np.diag([radius, 1e-16]))
     maps = PeriodMaps([(np.array([[0.7]]), np.array([[0.7]]))], [(M, M)])
     forms = np.ones((len(chain.lost), 1, 1))
