@@ -11,7 +11,9 @@ W⁻¹‖ over the times in question; r is added to H and M.
 events are missing: p = K e^{−Hs} (e_s + w) + …, where w is what at most M − 1 of them add to e_c, which
 :mod:`.gains` bounds, and "…" what the age s of the input adds, of x. With a matrix C in the middle of all K
 e^{−Hs} it is p = C e_s + q, and |q_j| ≤ κ_j R + |(K e^{−Hs})_j w| + …, κ_j a bound of ‖(K e^{−Hs} − C)_j
-W⁻¹‖. So from d on ė_s = (H − BC) e_s − (Ex + Bq + ω + Dd), and with M = H − BC
+W⁻¹‖. No two events up to this one were less than τ apart, by induction: so the lost ones are at least 0, τ,
+2τ, … old, and the suprema in their parts of w are those from there on. From d on ė_s = (H − BC) e_s − (Ex +
+Bq + ω + Dd), and with M = H − BC
 
     R ≤ g_M (g_H η + ∫₀^d N(e^{Hs}; p̂, …) ds) + ∫₀^{τ−d} N(e^{Ms}; q̂, …) ds + R ∫₀^{τ−d} N(e^{Ms}; κ) ds.
 
@@ -106,7 +108,7 @@ def _by_rest(gains: UnitGains, time: arb, delay: arb) -> arb:
     sources = [_Source(gains.value(each.of_error), gains.value(each.early)) for each in gains.sources]
     for j in range(B.ncols()):
         sources[j] = _Source(
-            gains.value(gains.lost(f"p {j}")) + gains.value(gains.by_age(j)),
+            gains.value(gains.lost(f"p {j}", time)) + gains.value(gains.by_age(j)),
             gains.sups[f"p before {j}"] if times.start > 0 else arb(0),
             norm_of((rows_of(of.aged, [j]) - rows_of(middle, [j])) * inverse),
             norm_of(rows_of(middle, [j]) * inverse),

@@ -83,6 +83,8 @@ _ROOM = 1e-9
 """By so much, relatively, y exceeds the solution of y = Fy + g."""
 _MOST_TESTS = 1_000_000
 """Over which an integral is averaged."""
+_MOST_AGES = 12
+"""Most lost events whose ages are told apart."""
 _CHORDS, _BETTER = 8, 0.999
 """Chords of √(θ² + s²) that are tried, while they are less steep by this factor."""
 
@@ -292,6 +294,8 @@ class _Responses:
         # Errors.
         self.scaled_H = H + rate * one
         errors = {"W": loop.weight} | {f"p {j}": rows_of(self.aged, [j]) for j in range(m)}
+        self._errors = errors
+        self._ever_after: tuple[str, list[dict[str, list[Response]]]] = ("", [])
         self.is_own = is_zero(self.compared.errors - loop.weight)
         self.columns = [self.inverse]
         if witness.comparison is not None and not self.is_own:
@@ -317,6 +321,26 @@ class _Responses:
     def growth(self, until: arb) -> list[Response]:
         """Return the growth of W e_s within a time, from W⁻¹ and by each source."""
         return responses_until(self.scaled_H, until, [self.loop.weight], self.columns)[0]
+
+    def ever_after(self, apart: arb) -> list[dict[str, list[Response]]]:
+        """Return :attr:`ever` from 0, 1, … times a time on, one for each lost event."""
+        if is_zero(self.scaled_H) or not 1 < self.lost <= _MOST_AGES:
+            return [self.ever] * self.lost
+        key = str(apart.fmpq())
+        if self._ever_after[0] != key:
+            aged = [(k * apart * self.scaled_H).exp() * Y for k in range(self.lost) for Y in self.columns]
+            rows = [C for name, C in self._errors.items() if name != "W"]
+            assert self.witness.model is not None
+            found, width = responses(self.scaled_H, self.witness.model, rows, aged), len(self.columns)
+            names = [name for name in self._errors if name != "W"]
+            self._ever_after = (
+                key,
+                [
+                    {name: row[width * k : width * (k + 1)] for name, row in zip(names, found, strict=True)}
+                    for k in range(self.lost)
+                ],
+            )
+        return self._ever_after[1]
 
     def _for_ever(self, outputs: Sequence[arb_mat]) -> list[list[Response]]:
         if is_zero(self.scaled_H):
@@ -400,21 +424,19 @@ class UnitGains:
         recent = self.responses.recent[name]
         terms, sources = self._after_test(recent), self.of_sources(recent)
         if self.responses.lost:
-            of_lost, further = self._lost(name)
+            of_lost, further = self._lost(self.responses.ever[name], self.responses.lost)
             terms += of_lost
             sources = [Response(b.most, a.total + b.total) for a, b in zip(sources, further, strict=True)]
         return _sum(*terms, *self.driven(sources))
 
-    def lost(self, name: str) -> Form:
-        """Return the bound of what the events that are lost add to an output |C e_c|."""
-        if not self.responses.lost:
-            return {}
-        terms, sources = self._lost(name)
-        return _sum(*terms, *self.driven(sources))
+    def lost(self, name: str, apart: arb) -> Form:
+        """Return the bound of what lost events add to an output |C e_c|, if two are at least so far apart."""
+        every = [self._lost(ever[name], 1) for ever in self.responses.ever_after(apart)]
+        return _sum(*(term for terms, sources in every for term in (*terms, *self.driven(sources))))
 
-    def _lost(self, name: str) -> tuple[list[tuple[arb, Form]], list[Response]]:
-        """Return terms of the bound of what lost events add, and the responses to the sources."""
-        lost, ever, untested = self.responses.lost, self.responses.ever[name], self.responses.untested
+    def _lost(self, ever: Sequence[Response], lost: int) -> tuple[list[tuple[arb, Form]], list[Response]]:
+        """Return terms of the bound of what so many lost events add, and the responses to the sources."""
+        untested = self.responses.untested
         gain = ever[0].most
         terms = [(lost * most, form) for most, form in self._after_test(ever)]
         terms.append((lost * gain, {"1": self.unit.noise}))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import fmpq
+from flint import arb, fmpq
 from scipy.linalg import expm
 
 from noack.theory.witnesses.documents import witness_by_gains
@@ -52,7 +52,7 @@ def least_time(loop: Loop, until_s: float = 40.0) -> float:
     As many updates as may be are lost, one after the other; the others act as late as they may. Each
     measurement has the noise that brings the next event nearer.
     """
-    H, gain, delay = float(floats(loop.H)[0, 0]), 2 * 0.505, float(loop.times.delay)
+    H, gain, delay = float(floats(loop.H)[0, 0]), -2 * float(loop.gain[0, 0]), float(loop.times.delay)
     level, push = float(loop.rule.level), float(loop.sizes[0])
     noise = float(loop.noise[0, 0]) if loop.noise.ncols() else 0.0
     F = np.array([[H + gain, gain, push], [0.0, H, 0.0], [0.0, 0.0, 0.0]])
@@ -89,7 +89,14 @@ def least_time(loop: Loop, until_s: float = 40.0) -> float:
         steady(2, level=1.1),
         steady(0, disturbance=1.0)._replace(noise=NOISE),
     ],
-    ids=["a disturbance", "one loss", "two losses", "five losses", "a threshold with a kink", "noise"],
+    ids=[
+        "a disturbance",
+        "one loss",
+        "two losses",
+        "five losses",
+        "a threshold with a kink",
+        "noise",
+    ],
 )
 def test_a_run_nearly_has_the_least_time(loop: Loop) -> None:
     """So 1.05 times the proven one is false, and rejected."""
@@ -125,6 +132,19 @@ def test_a_time_for_less_is_not_one_for_more(loop: Loop, lie: Loop) -> None:
     document["gains"]["inter_event_s"] = false
     with pytest.raises(RejectedError, match="an event may come earlier"):
         prove(loop, document)
+
+
+def test_errors_of_older_lost_updates_have_fallen() -> None:
+    """They are at least 0, 1, 2 times the proven time old. In a run they are older, at the first losses."""
+    loop = steady(3)._replace(gain=number(-0.7) * identity(1))
+    document, proof = proven(loop)
+    stated = document["gains"]["inter_event_s"]
+    assert proof.inter_event == number(stated).fmpq()
+    assert 0.85 * least_time(loop) < stated <= least_time(loop)
+    (gains,) = (unit for unit in Gains(loop, arb(0), document["gains"]).units)
+    young, old = (float(gains.value(gains.lost("p 0", number(time)))) for time in (0.0, stated))
+    decay = [math.exp(-0.4 * k * stated) for k in range(3)]
+    assert old / young == pytest.approx(sum(decay) / 3, rel=1e-3)
 
 
 def test_both_parts_of_a_threshold_do_not_count_at_its_kink() -> None:
@@ -164,7 +184,9 @@ def test_the_next_test_after_silent_ones_is_the_first_that_may_be_an_event() -> 
     assert 1 / 50 < stated < float(tests) < stated + 1 / 50
     assert (50 * tests).q == 1
     nearer = prove(changed(loop, least_sampling=fmpq(1, 51)), document).inter_event
-    assert nearer == fmpq(50, 51) * tests
+    assert nearer == max(number(stated).fmpq(), fmpq(50, 51) * tests)
+    far = changed(loop, least_sampling=fmpq(1, 500))
+    assert prove(far, document).inter_event == number(stated).fmpq()
 
 
 def test_without_a_comparison_events_are_as_far_apart_as_tests() -> None:

@@ -21,7 +21,7 @@ from noack_check.proof import compares_error
 
 _SHARES = (1.0, 0.5, 0.2, 0.0)
 """Rates that are tried, in multiples of the largest one."""
-_FIRST_S, _NEARLY, _STEPS = 1e-6, 0.99, 12
+_FIRST_S, _NEARLY, _STEPS = 1e-6, 0.997, 16
 """A time between events is accepted if e_s reaches nearly the threshold."""
 _AVERAGED = 2.0 ** np.arange(-8, 5)
 """Times over which an integral of the error is averaged, in time constants of the loop."""
@@ -156,12 +156,18 @@ def _inter_event_s(gains: Gains) -> float:
     def share(time: float) -> float:
         return float(share_of_threshold(gains, number(time)))
 
-    short, at_once, time = 0.0, share(0.0), _FIRST_S
+    wanted, at_once, time = (1 + _NEARLY) / 2, share(0.0), _FIRST_S
+    short, long = (0.0, at_once), (np.inf, np.inf)
     for _ in range(_STEPS if at_once < _NEARLY else 0):
         reached = share(time)
         if reached < 1:
-            short = max(short, time)
+            short = max(short, (time, reached))
+        else:
+            long = min(long, (time, reached))
         if _NEARLY < reached < 1:
             break
-        time *= ((1 + _NEARLY) / 2 - at_once) / max(reached - at_once, 1e-9)
-    return short
+        if np.isfinite(long[1]) and short[0]:  # between both
+            time = short[0] + (long[0] - short[0]) * (wanted - short[1]) / (long[1] - short[1])
+        else:
+            time *= (wanted - at_once) / max(reached - at_once, 1e-9)
+    return short[0]
