@@ -13,20 +13,15 @@ from tests.helpers.command_line import invoke
 pytestmark = pytest.mark.usefixtures("nothing_was_found_before")
 
 
-def guarantee_line(scenario: str, **settings: object) -> str:
-    line = noack.simulate(noack.load(scenario, {"horizon_s": 1.0, **settings})).verdict[-2]
-    assert line.tone == Tone.DOUBTFUL
-    return line.text
-
-
-@pytest.mark.parametrize("name", ["model_predictive", "lane_python_trigger"])
-def test_a_run_that_no_certificate_covers_says_why_as_certify_does(name: str) -> None:
-    answer = noack.certify(name).answer
-    assert not answer.is_certified
-    assert guarantee_line(name) == f"guarantee not checkable: {answer.text}"
-
-
-@pytest.mark.parametrize(("name", "is_certified"), [("lane_following", True), ("cart_pole", False)])
+@pytest.mark.parametrize(
+    ("name", "is_certified"),
+    [
+        ("lane_following", True),
+        ("cart_pole", False),
+        ("model_predictive", False),
+        ("lane_python_trigger", False),
+    ],
+)
 def test_the_answer_of_certify_is_that_of_the_run(name: str, is_certified: bool) -> None:
     answer = noack.certify(name, search=False).answer
     assert answer.is_certified == is_certified

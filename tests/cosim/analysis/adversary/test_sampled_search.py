@@ -159,7 +159,7 @@ def test_the_search_finds_the_worst_of_all_patterns(policy: str, mode: str) -> N
     ],
     ids=["delay", "slow ticks", "fast ticks", "disturbed", "observed"],
 )
-@pytest.mark.parametrize("plant_hz", [20.0, 30.0, 18.0])  # 30 and 18: no whole number of nanoseconds
+@pytest.mark.parametrize("plant_hz", [20.0, 18.0])  # 18: no whole number of nanoseconds
 def test_a_pattern_makes_the_run_of_the_machines(sections: dict[str, Any], plant_hz: float) -> None:
     sections = {**sections, "plant": sections.get("plant", {}) | {"rate_hz": plant_hz}}
     resolved = scenario_of({"policy": "mixed", "sigma": 0.05, "epsilon": 0.05}, **sections)

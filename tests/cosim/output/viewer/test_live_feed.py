@@ -47,8 +47,7 @@ def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks
     return run, read(folder / RECORDING_FILE), messages
 
 
-@pytest.mark.parametrize("count", [3, 30])
-@pytest.mark.parametrize("phase", ["0.0", "0.3"])
+@pytest.mark.parametrize(("count", "phase"), [(3, "0.3"), (30, "0.0")])
 def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phase: str) -> None:
     run, chunks, messages = shown(tmp_path, count, f"controller.phase={phase}")
     expected = loops_over_time(run)
