@@ -29,13 +29,16 @@ from noack.protocol.roles import LOOP_ROLES
 
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _MADV_POPULATE_READ, _MADV_POPULATE_WRITE = 22, 23
-"""Constants of Linux, from <linux/prctl.h> and <sys/mman.h>."""
+"""Constants of Linux and glibc, from <linux/prctl.h>, <sys/mman.h> and <malloc.h>."""
 _LAST_PLACE = len(LOOP_ROLES) - 1
 """Place of the last process of the loop, which alone has the scenario's priority. Each earlier one
 has a priority lower by 1."""
 _CPU_DMA_LATENCY = Path("/dev/cpu_dma_latency")
 _LARGE_BYTES = 16 * 2**20
+_KEPT_BYTES = 32 * 2**20
+"""Freed memory that the process keeps: batches of rows would else need new pages, a microsecond each."""
 _MAPPINGS = Path("/proc/self/smaps")
 _MAPPING = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (...)(?s:.*?)^Shared_Dirty: +([0-9]+)", re.MULTILINE)
 
@@ -126,11 +129,14 @@ def lock_memory() -> None:
         OSError: it is not permitted.
     """
     _call_system("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
-    madvise = ctypes.CDLL(None).madvise
+    library = ctypes.CDLL(None)
+    with suppress(AttributeError):  # not glibc
+        for threshold in (_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD):
+            library.mallopt(threshold, _KEPT_BYTES)
     for mapping in _mappings():
         if mapping.bytes <= _LARGE_BYTES:
             # Fails for special mappings, and before Linux 5.14: then each page is locked at its use
-            madvise(ctypes.c_void_p(mapping.first), ctypes.c_size_t(mapping.bytes), mapping.advice)
+            library.madvise(ctypes.c_void_p(mapping.first), ctypes.c_size_t(mapping.bytes), mapping.advice)
 
 
 class _Mapping(NamedTuple):
