@@ -38,14 +38,28 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
         if times.period > 0:
             least = f"{ms['least_period']} to " if times.least_period < times.period else ""
             parts.append(f"events every {least}{ms['period']}")
-    rule = loop.rule
-    if times.sampling == 0 and rule.positive.nrows() and rule.level == 0 and rule.floor == 0:
-        parts.append("as long as events do not accumulate")  # nothing keeps two of them apart
+    if _may_accumulate(loop):
+        parts.append("as long as events do not accumulate")
     if loop.until is not None:
         parts.append(f"up to {float(arb(loop.until).mid()):g} s, all about the reference")
     if scenario.get("changes"):
         parts.append("until the first change of settings")
     return ", ".join(parts)
+
+
+def _may_accumulate(loop: Loop) -> bool:
+    """Return whether nothing may keep two events apart.
+
+    With tests at all times a threshold does if it is above 0, and above what the noises of two measurements
+    add up to: only the rest has to be reached by a flow. An integral begins at 0.
+    """
+    rule = loop.rule
+    if loop.times.least_apart > 0 or not rule.positive.nrows():
+        return False
+    noise = 2 * loop.plain_noise.sizes[1]
+    if noise == 0 or rule.integrates:
+        return not (rule.level > 0 or rule.floor > 0)
+    return not (rule.floor > noise or (rule.rate == 0 and rule.level > noise))
 
 
 def origin_text(scenario: Mapping[str, object], loop: Loop) -> str:

@@ -193,5 +193,25 @@ def test_what_is_assumed_of_events_without_a_least_time_is_said() -> None:
     """A relative rule that is tested at all times has no threshold that keeps two events apart."""
     assert assumptions({}, relative(0.1)).endswith(", as long as events do not accumulate")
     tested = relative(0.1)._replace(times=SCHEDULE)
-    for loop in (tested, double_integrator(IDEAL), double_integrator(IDEAL, level=0.0, floor=0.1)):
+    held = relative(0.1)._replace(times=IDEAL._replace(dwell=fmpq(1, 10)))
+    for loop in (tested, held, double_integrator(IDEAL), double_integrator(IDEAL, level=0.0, floor=0.1)):
         assert "accumulate" not in assumptions({}, loop)
+
+
+@pytest.mark.parametrize(
+    ("level", "floor", "rate", "times", "is_said"),
+    [
+        (0.05, 0.0, 0.3, IDEAL, True),  # the threshold falls below what two noises add up to
+        (0.05, 0.019, 0.3, IDEAL, True),
+        (0.05, 0.021, 0.3, IDEAL, False),
+        (0.05, 0.0, 0.0, IDEAL, False),
+        (0.05, 0.0, 0.3, SCHEDULE, False),
+    ],
+)
+def test_noise_alone_may_make_events_accumulate(
+    level: float, floor: float, rate: float, times: Times, is_said: bool
+) -> None:
+    """Of noises of 0.01 two differ by 0.02: at all times the second one may be an event."""
+    loop = double_integrator(times, level=level, floor=floor)
+    loop = loop._replace(noise=matrix([[0.01], [0.0]]), rule=loop.rule._replace(rate=number(rate)))
+    assert ("accumulate" in assumptions({}, loop)) == is_said
