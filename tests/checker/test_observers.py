@@ -177,6 +177,22 @@ def test_at_rate_0_all_bounds_are_constant() -> None:
     assert largest_share(LOOP, bounds, 0.0, simulated_errors(LOOP, rng, 400)) <= 1
 
 
+FOUR_STATES = (
+    "model={A=[[1.27025,-0.39836,0.0589018,-2.10487],[-0.823096,0.666567,0.504427,-0.817716],"
+    "[0.428062,-0.916517,-0.899377,-2.30207],[0.357575,0.51807,0.731872,1.44108]],"
+    "B=[[-0.56758],[-0.740994],[-0.346462],[-0.460969]],gain=[[-9.286317,6.127737,3.019875,11.424124]]}",
+    "plant={initial_state=[0.5,-1.0,-0.1,-0.7],"
+    "measurement={C=[[1.89763,0.860966,-0.0290367,0.0649595]],noise_bound=[1e-6]}}",
+    'observer={kind="luenberger",poles_per_s=[-10.0,-13.0,-16.0,-19.0]}',
+)  # fmt: skip
+
+
+def test_a_smooth_part_with_rounding_is_found_without_a_warning() -> None:
+    """A warning would be an error here: scipy doubts the logarithm, which need not be right."""
+    loop = read_loop(resolved_tables("double_integrator", *FOUR_STATES), box=False, ideal=False)
+    assert np.linalg.eigvals(floats(smooth_of(loop).rates)).real.max() == pytest.approx(-10.0, abs=1e-3)
+
+
 # The model.
 
 

@@ -5,6 +5,7 @@ itself. Nothing here has to be right: :mod:`noack_check.proof` proves what is as
 """
 
 import contextlib
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -193,7 +194,8 @@ def smooth_part(loop: Loop) -> dict[str, object] | None:
         S, step = np.eye(n), F
     else:  # after n steps nothing else is left
         first = np.linalg.matrix_power(np.linalg.inv(step), n) @ S.T @ np.linalg.matrix_power(F, n) @ first
-    rates = logm(step).real / period_s
+    with warnings.catch_warnings(action="ignore"):  # of rounding: nothing of this part has to be right
+        rates = logm(step).real / period_s
     return {"columns": S.tolist(), "rates": rates.tolist(), "start": first.tolist()}
 
 
