@@ -147,6 +147,13 @@ def test_errors_of_older_lost_updates_have_fallen() -> None:
     assert old / young == pytest.approx(sum(decay) / 3, rel=1e-3)
 
 
+def test_of_events_that_never_come_a_time_with_a_meaning_is_stated() -> None:
+    """Without losses, and with a model that is the plant, nothing moves e_s."""
+    document, proof = proven(scalar(0, IDEAL))
+    assert document["gains"]["inter_event_s"] == 1e9
+    assert proof.inter_event == 10**9
+
+
 def test_both_parts_of_a_threshold_do_not_count_at_its_kink() -> None:
     """There v = 0.1, and 9v + 1 is what two units make of a threshold of 1."""
     loop = steady(2, level=10.0)

@@ -23,6 +23,8 @@ _SHARES = (1.0, 0.5, 0.2, 0.0)
 """Rates that are tried, in multiples of the largest one."""
 _FIRST_S, _NEARLY, _STEPS = 1e-6, 0.997, 16
 """A time between events is accepted if e_s reaches nearly the threshold."""
+_LONGEST_S = 1e9
+"""A longer time between events is not stated: nothing may move e_s."""
 _AVERAGED = 2.0 ** np.arange(-8, 5)
 """Times over which an integral of the error is averaged, in time constants of the loop."""
 _SLACK = 1e-10
@@ -164,10 +166,10 @@ def _inter_event_s(gains: Gains) -> float:
             short = max(short, (time, reached))
         else:
             long = min(long, (time, reached))
-        if _NEARLY < reached < 1:
+        if _NEARLY < reached < 1 or short[0] == _LONGEST_S:
             break
         if np.isfinite(long[1]) and short[0]:  # between both
             time = short[0] + (long[0] - short[0]) * (wanted - short[1]) / (long[1] - short[1])
         else:
-            time *= (wanted - at_once) / max(reached - at_once, 1e-9)
+            time = min(time * (wanted - at_once) / max(reached - at_once, 1e-9), _LONGEST_S)
     return short[0]
