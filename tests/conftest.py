@@ -31,7 +31,8 @@ sys.dont_write_bytecode = False
 gc.disable()  # until everything is loaded, of which nothing is garbage
 
 FIRST = (
-    "tests/native/test_sanitized.py", "tests/test_doc_programs.py",
+    "tests/native/test_sanitized.py", "tests/checker/test_random_loops.py", "tests/test_doc_programs.py",
+    "tests/checker/test_mutations.py", "tests/checker/test_periodic_rules.py",
     "tests/integration/", "tests/native/", "tests/cosim/simulation/test_whole_loop.py", "tests/test_docs.py",
     "tests/attacks/", "tests/cosim/",
     "tests/netem/", "tests/noack/plants/", "tests/noack/theory/",
