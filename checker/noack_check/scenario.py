@@ -5,10 +5,10 @@ refuses has no loop. A reference, or a set-point, which is a constant one, is mo
 :mod:`.reference`.
 """
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
+from functools import lru_cache
 from typing import NamedTuple, Required, TypedDict
 
 from flint import arb, arb_mat, fmpq
@@ -816,22 +816,19 @@ def _kalman_gains(resolved: Table, A: Rows, C: Rows) -> tuple[arb_mat, ...]:
     """Return the gains of the Kalman filter in the sensor; see :meth:`.kalman.KalmanFilter.gains`."""
     observer, schedule = _table(resolved, "observer"), read_schedule(resolved)
     std = _row(observer, "observer.initial_std")
+    noises = (_matrix(observer, f"observer.{key}") for key in ("Q", "R"))
+    A, C, Q, R = (tuple(map(tuple, M)) for M in (A, C, *noises))
+    return _gains_of(A, C, Q, R, tuple(std), int(schedule.step), int(schedule.sample / schedule.step))
+
+
+@lru_cache(maxsize=16)
+def _gains_of(
+    A: Rows, C: Rows, Q: Rows, R: Rows, std: Sequence[float], step_ns: int, steps: int
+) -> tuple[arb_mat, ...]:
+    """Return the gains; a search reads a scenario many times, so those of the last filters are kept."""
     start = [[number(value) ** 2 * int(i == j) for j in range(len(std))] for i, value in enumerate(std)]
-    h = fmpq(int(schedule.step), NS_PER_S)
-    Q, R = (_matrix(observer, f"observer.{key}") for key in ("Q", "R"))
-    key = json.dumps([A, C, Q, R, std, str(h), str(schedule.sample)])
-    if key not in _gains:
-        if len(_gains) >= _MOST_GAINS:
-            del _gains[next(iter(_gains))]
-        steps = int(schedule.sample / schedule.step)
-        flow = (arb(h) * matrix(A)).exp()
-        _gains[key] = KalmanFilter(flow, matrix(Q), steps, matrix(C), matrix(R), arb_mat(start)).gains()
-    return _gains[key]
-
-
-_MOST_GAINS = 16
-_gains: dict[str, tuple[arb_mat, ...]] = {}
-"""Those of the last filters: a search reads a scenario many times."""
+    flow = (arb(fmpq(step_ns, NS_PER_S)) * matrix(A)).exp()
+    return KalmanFilter(flow, matrix(Q), steps, matrix(C), matrix(R), arb_mat(start)).gains()
 
 
 def _require_unknown_start(resolved: Table, what: str) -> None:
