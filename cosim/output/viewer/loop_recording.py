@@ -151,7 +151,7 @@ The network ({network.loss.model.replace("_", "-")} loss) guarantees:
 {network.guarantee.meaning}.
 {scenario.protocol.summary}
 
-* A finished run opens at its largest ‖e_c‖. **Colours** explains the colours.
+* A window opens a finished run at its largest ‖e_c‖. **Colours** explains the colours.
 * **Picture**: the plant (solid), the sensor's model (outline) and the controller's model (dashed
   outline). Play the run to animate it.
 * **Packets**: each update in flight. A lost one falls; a forced delivery is a diamond. A flight

@@ -9,7 +9,7 @@ Every user of the machine can connect to the server. Therefore all content is un
 with a secret; other paths do not exist. rerun's own servers of recordings (``serve_grpc``, ``rerun
 --serve-web FILE``) have no secret: each user could read the run, and add to it.
 
-A finished run opens at the time of the largest ‖e_c‖.
+A window opens a finished run at the time of the largest ‖e_c‖.
 """
 
 import contextlib
@@ -44,7 +44,6 @@ from cosim.output.viewer.rerun_program import (
     has_display,
     move_window_to,
     require_recording,
-    script_to_open_at,
     start_rerun,
     window_port,
 )
@@ -258,9 +257,6 @@ class _Handler(BaseHTTPRequestHandler):
                 self.end_headers()
                 while block := answer.read(_BLOCK_BYTES):
                     self.wfile.write(block)
-                t_ns = opening_time_ns(self.server.recording.path) if name == "" else None
-                if t_ns is not None:
-                    self.wfile.write(script_to_open_at(TIMELINE, t_ns))
         except PeerError as error:
             self.send_error(502, str(error))
 

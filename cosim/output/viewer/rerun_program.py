@@ -5,10 +5,8 @@ the Python library listens on all addresses). Any user of the machine could list
 the program has ended. Therefore the kernel selects the port, and an answer is used only if the
 program still runs after it: then the port was the program's.
 
-Neither a layout in a recording nor the address of a recording can set the viewer's time cursor; only
-requests to a running viewer can. The window accepts the requests of rerun's client. The web viewer
-has one function for this, ``viewer_control``; it takes a protobuf message ``ViewerControlRequest``,
-which nothing in rerun's Python library writes.
+A layout in a recording cannot set the viewer's time cursor; only requests of rerun's client to an
+open window can.
 """
 
 import contextlib
@@ -45,17 +43,6 @@ _RETRY_S = 0.25
 _LOAD_S = 60.0
 """Maximum time until a window accepts requests."""
 _TAKES_REQUESTS_AT = re.compile(rb"rerun\+http://127\.0\.0\.1:(\d+)")
-_SET_TIME_CURSOR, _TIMELINE, _TIME, _PLAY_STATE, _FIRST = 6, 2, 3, 5, 1
-"""Numbers of the message's fields; nested messages have only a first field."""
-_PAUSED = 1
-_SCRIPT = """<script>
-(function openAt() {{
-  const retry = () => setTimeout(openAt, {retry_ms});
-  if (window._handle === undefined) return retry();
-  window._handle.viewer_control(new Uint8Array({request})).catch(retry);
-}})();
-</script>
-"""
 
 
 def is_installed() -> bool:
@@ -217,12 +204,6 @@ class WebViewer:
         end_process(self.process)
 
 
-def script_to_open_at(timeline: str, t_ns: int) -> bytes:
-    """Return HTML for the web viewer's page: it moves the cursor once the recording is loaded."""
-    request = list(_cursor_request(timeline, t_ns))
-    return _SCRIPT.format(retry_ms=round(1e3 * _RETRY_S), request=request).encode()
-
-
 def window_port(window: "subprocess.Popen[bytes]", output: IO[bytes], within_s: float) -> int | None:
     """Return the port at which a window accepts requests, as :func:`logged_port` does."""
     return logged_port(window, output, _TAKES_REQUESTS_AT, within_s)
@@ -249,27 +230,3 @@ def move_window_to(timeline: str, t_ns: int, window: "subprocess.Popen[bytes]", 
             time.sleep(_RETRY_S)
         else:
             return
-
-
-def _cursor_request(timeline: str, t_ns: int) -> bytes:
-    """Return a ViewerControlRequest in protobuf's encoding."""
-    cursor = (
-        _nested_field(_TIMELINE, _nested_field(_FIRST, timeline.encode()))
-        + _nested_field(_TIME, _number_field(_FIRST, t_ns))
-        + _number_field(_PLAY_STATE, _PAUSED)
-    )
-    return _nested_field(_SET_TIME_CURSOR, cursor)
-
-
-def _nested_field(field: int, content: bytes) -> bytes:
-    """Return a length-delimited field in protobuf's encoding."""
-    return _varint(field << 3 | 2) + _varint(len(content)) + content
-
-
-def _number_field(field: int, value: int) -> bytes:
-    return _varint(field << 3) + _varint(value)
-
-
-def _varint(value: int) -> bytes:
-    low, rest = value & 0x7F, value >> 7
-    return bytes([low | 0x80]) + _varint(rest) if rest else bytes([low])
