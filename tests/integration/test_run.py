@@ -16,8 +16,6 @@ import pytest
 import rerun.chunk
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.analysis.explained_run.explain import explains
-from cosim.analysis.explained_run.findings import SCHEDULE
 from cosim.analysis.replay import replay
 from cosim.output.viewer import blueprint
 from cosim.record.run_events import changes_of
@@ -46,6 +44,8 @@ from tests.helpers.live_runs import (
     start_runs,
     wait_for,
 )
+from tests.oracles.explained_run.explain import explains
+from tests.oracles.explained_run.findings import SCHEDULE
 
 CERTIFIED = "certified for the scenario's plant"
 

@@ -22,7 +22,6 @@ import numpy as np
 
 from cosim.analysis.adversary import Objective, find_worst
 from cosim.analysis.certificates import certificates_of
-from cosim.analysis.explained_run.explain import explains
 from cosim.analysis.replay.run_replay import replay_run
 from cosim.analysis.scenario_certificates import certificate_of, quick_certificate
 from cosim.analysis.witnesses import find_statement, plants_of
@@ -41,6 +40,7 @@ from noack.trigger_policies.decaying import DecayingSettings
 from noack_check.proof import Proof
 from tests.fuzz.scenarios.draws import Draw, draw, drawn_keys
 from tests.fuzz.scenarios.proven_bounds import proven_limit, sizes_of
+from tests.oracles.explained_run.explain import explains
 from tests.oracles.paper_attacks import largest_share
 
 LIMIT_S = 60.0

@@ -9,7 +9,6 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 from scipy.stats import chi2
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.analysis.explained_run.explain import explains
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.align import align_tables, true_states
@@ -23,6 +22,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from tests.cosim.simulation.outage import LosingMachine, simulate_with
+from tests.oracles.explained_run.explain import explains
 
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
 KALMAN = {"kind": "kalman", "initial_std": [0.4, 0.4]}

@@ -4,11 +4,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from cosim.analysis.explained_run.findings import ExplainedLoop, bound_at, exponential, is_moderate
 from cosim.record.rows import Rows
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.estimation import assumed_model
+from tests.oracles.explained_run.findings import ExplainedLoop, bound_at, exponential, is_moderate
 
 PLANT, MEASUREMENT, OBSERVER = "plant", "measurement", "observer"
 

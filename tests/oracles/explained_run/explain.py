@@ -7,16 +7,16 @@ up to its first extreme number. Acknowledgements, users' control laws and nonlin
 part of the model: of these x_s, u or x is not checked.
 """
 
-from cosim.analysis.explained_run.applied_inputs import check_applied, check_schedule
-from cosim.analysis.explained_run.controller_inputs import check_controller
-from cosim.analysis.explained_run.findings import ExplainedLoop, Unexplained
-from cosim.analysis.explained_run.network_losses import check_updates
-from cosim.analysis.explained_run.plant_flow import check_measurements, check_observer, check_plant
-from cosim.analysis.explained_run.sensor_events import check_events
 from cosim.record.run_record import RunRecord
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import NetworkConditions, nominal_conditions
 from noack.theory.coverage import is_papers_loop
+from tests.oracles.explained_run.applied_inputs import check_applied, check_schedule
+from tests.oracles.explained_run.controller_inputs import check_controller
+from tests.oracles.explained_run.findings import ExplainedLoop, Unexplained
+from tests.oracles.explained_run.network_losses import check_updates
+from tests.oracles.explained_run.plant_flow import check_measurements, check_observer, check_plant
+from tests.oracles.explained_run.sensor_events import check_events
 
 _CHECKS = (
     check_plant, check_measurements, check_observer, check_events, check_updates, check_controller,

@@ -8,7 +8,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.explained_run.findings import SCHEDULE, ExplainedLoop
 from cosim.record.rows import Rows
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
@@ -20,6 +19,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
 )
 from noack.theory.certificates.conditions import NetworkConditions
+from tests.oracles.explained_run.findings import SCHEDULE, ExplainedLoop
 
 Numbers = NDArray[np.int64]
 INPUTS = "applied inputs"

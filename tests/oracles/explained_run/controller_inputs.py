@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.explained_run.findings import ExplainedLoop, is_moderate
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -13,6 +12,7 @@ from noack.protocol.record_tables import (
     PLANT_ACTUATION,
     SENSOR_MEASUREMENT,
 )
+from tests.oracles.explained_run.findings import ExplainedLoop, is_moderate
 
 CONTROLLER = "controller"
 

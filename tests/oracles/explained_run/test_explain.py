@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cosim.analysis.explained_run.explain import explains
-from cosim.analysis.explained_run.findings import SCHEDULE
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate_loops
 from noack.protocol.record_tables import NO_SEQUENCE, Fate
@@ -16,6 +14,8 @@ from noack.scenario.resolution import resolve_run
 from noack.theory.certificates.conditions import ideal_conditions
 from tests.cosim.record.changed_records import changed, copied
 from tests.helpers.shipped import resolved, shipped
+from tests.oracles.explained_run.explain import explains
+from tests.oracles.explained_run.findings import SCHEDULE
 
 Change = Callable[[Mapping[str, Rows]], None]
 _SINE = "{kind='sine',at='state',amplitude=[0.0,0.0,0.1,0.1],hz=2.0}"

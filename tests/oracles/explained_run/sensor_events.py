@@ -9,11 +9,11 @@ import math
 
 import numpy as np
 
-from cosim.analysis.explained_run.findings import ExplainedLoop, is_moderate
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.scenario.resolution import policy_of
 from noack.trigger_policies.trigger_rule import Forecast, TriggerRule
+from tests.oracles.explained_run.findings import ExplainedLoop, is_moderate
 
 MODEL, TRIGGER = "sensor's model", "trigger"
 _NEAR = 1e-8

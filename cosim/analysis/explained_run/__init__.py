@@ -1,1 +1,0 @@
-"""Whether a recorded run is a run of the model of its scenario (:func:`.explain.explains`)."""
