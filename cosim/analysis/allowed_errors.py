@@ -6,13 +6,14 @@ if the checker proves it. With disturbances smaller values follow, as far as the
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from cosim.analysis.tried_settings import replaced
 from cosim.analysis.witnesses import find_statement
 from noack.core.errors import NoackError
 from noack.core.number_format import at_most, to_digits
+from noack.core.progress import Progress
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
@@ -31,7 +32,7 @@ class ThresholdTrials:
     plants: str
     """"own" or "box"."""
 
-    def advice(self, bound: OutputBound, index: int, progress: Callable[[float], None]) -> str:
+    def advice(self, bound: OutputBound, index: int, progress: Progress) -> str:
         """Return which threshold brings an output within its allowed error, in words.
 
         Args:

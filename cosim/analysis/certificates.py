@@ -1,7 +1,7 @@
 """All certificates of a scenario: as one object, as JSON, and as rows of a table."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ from cosim.analysis.witnesses import Unproven, Witnesses, find_witnesses, with_l
 from noack.core.errors import CallerError
 from noack.core.number_checks import whole_number
 from noack.core.number_format import TextRows, as_html, as_text
+from noack.core.progress import Progress, no_progress
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -99,7 +100,7 @@ class Certificates:
 
     def prove(
         self,
-        progress: Callable[[float], None] = lambda share: None,
+        progress: Progress = no_progress,
         most_work: float = MOST_WORK,
         conditions: Sequence[str] = ("ideal", "schedule"),
         near: Sequence[Mapping[str, object]] = (),
@@ -121,7 +122,7 @@ class Certificates:
             self._found.append((under, certificate))
         return found
 
-    def advise(self, progress: Callable[[float], None] = lambda share: None) -> None:
+    def advise(self, progress: Progress = no_progress) -> None:
         """Search for a smaller threshold for each output whose bound exceeds its allowed error."""
         certificate = self.guaranteed
         if certificate is None or not self.scenario.coverage.is_linear:

@@ -7,7 +7,6 @@ the loop from the resolved scenario itself.
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from itertools import islice
 from typing import NamedTuple
 
@@ -17,6 +16,7 @@ from flint import fmpq
 from cosim.analysis.witness_store import StoredSearch, WitnessStore
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
+from noack.core.progress import Progress, no_progress, part_of
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations, trace
 from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import loop_of
@@ -103,7 +103,7 @@ def plants_of(resolved: Scenario) -> list[str]:
 
 def find_witnesses(
     resolved: Scenario,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = no_progress,
     most_work: float = MOST_WORK,
     conditions: Sequence[str] = ("ideal", "schedule"),
     near: Sequence[Mapping[str, object]] = (),
@@ -120,7 +120,7 @@ def find_witnesses(
     wanted = [(plants, under) for under in conditions for plants in plants_of(resolved)]
     found: list[WitnessedStatement] = []
     for index, (plants, under) in enumerate(wanted):
-        part = partial(_part_of, progress, index, len(wanted))
+        part = part_of(progress, index / len(wanted), (index + 1) / len(wanted))
         known = [*near] if plants == "region" else []  # other searches of ideal conditions are short
         if under == "schedule":
             found_near = (s for s in found if s.plants == plants or s.conditions == under)
@@ -128,11 +128,6 @@ def find_witnesses(
         found.append(find_statement(resolved, plants, under, part, most_work, known))
     progress(1.0)
     return Witnesses(resolved_content(resolved), found)
-
-
-def _part_of(progress: Callable[[float], None], index: int, count: int, share: float) -> None:
-    """Report the progress of one of several searches."""
-    progress((index + share) / count)
 
 
 def require_covered(resolved: Scenario) -> None:
@@ -167,7 +162,7 @@ def find_statement(
     resolved: Scenario,
     plants: str,
     conditions: str,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = no_progress,
     most_work: float = MOST_WORK,
     near: Sequence[Mapping[str, object]] = (),
     *,
@@ -253,7 +248,7 @@ def plant_on_regions(
 
 def known_or_found(
     loop: Loop,
-    progress: Callable[[float], None],
+    progress: Progress,
     most_work: float,
     *,
     has_outputs: bool = True,
@@ -290,7 +285,7 @@ def _wanted(loop: Loop, *, has_outputs: bool) -> tuple[Sequence[str], Sequence[s
 
 def known_or_found_on_region(
     plant: PlantOnRegions,
-    progress: Callable[[float], None],
+    progress: Progress,
     most_work: float,
     *,
     has_outputs: bool = True,

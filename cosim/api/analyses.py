@@ -8,6 +8,7 @@ from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.analysis.mean_cost import MeanCost, find_mean_cost
 from cosim.api.scenarios import Source, load
 from cosim.live.monitoring.progress import work_bar
+from noack.core.progress import no_progress
 from noack.scenario.resolution import resolve
 from noack.theory.witnesses.effort import MOST_WORK
 from noack.theory.witnesses.growth import ACCURACY
@@ -41,8 +42,8 @@ def certify(
         NoackError: the scenario is wrong, or its settings change during the run.
     """
     certificates = certificates_of(load(scenario), late)
-    with work_bar("searching for proofs", lines=True) if progress else nullcontext() as bar:
-        certificates.prove(bar or (lambda share: None), MOST_WORK if search else 0.0)
+    with work_bar("searching for proofs", lines=True) if progress else nullcontext(no_progress) as bar:
+        certificates.prove(bar, MOST_WORK if search else 0.0)
     return certificates
 
 

@@ -2,11 +2,12 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from noack.core.progress import Progress, no_progress
 from noack.theory.witnesses.assumptions import (
     first_assumptions,
     first_event_s,
@@ -70,7 +71,7 @@ def find_witness(
     *,
     ultimate: Sequence[str] = (),
     near: Sequence[Mapping[str, object]] = (),
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = no_progress,
     most_work: float = MOST_WORK,
 ) -> Witness:
     """Return a witness for bounds of some outputs, and of what follows from them.

@@ -1,6 +1,6 @@
 """The effort of a search: how far it is, and when it ends. It is counted in problems, not in seconds."""
 
-from collections.abc import Callable
+from noack.core.progress import Progress
 
 MOST_WORK = 20.0
 """A search ends after so many 10⁹ products per step of the solver: some minutes."""
@@ -25,7 +25,7 @@ class Effort:
         most_work: the search ends before the problem with which its work would exceed this.
     """
 
-    def __init__(self, progress: Callable[[float], None], most_work: float = MOST_WORK) -> None:
+    def __init__(self, progress: Progress, most_work: float = MOST_WORK) -> None:
         self._progress, self._most_work = progress, most_work
         self._problems, self._expected, self._work, self._share = 0, 0, 0.0, 0.0
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Vector
+from noack.core.progress import Progress, no_progress, part_of
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.documents import (
@@ -54,7 +55,7 @@ def find_region_witness(
     *,
     ultimate: Sequence[str] = (),
     near: Sequence[Mapping[str, object]] = (),
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = no_progress,
     most_work: float = MOST_WORK,
 ) -> Witness:
     """Return a witness for bounds of outputs of a plant on a region that it is proven not to leave.
@@ -71,7 +72,7 @@ def find_region_witness(
     Raises:
         NoWitnessError: none was found; the message names the region that would be needed.
     """
-    effort = Effort(lambda share: progress(share / 2), most_work)
+    effort = Effort(part_of(progress, 0.0, 0.5), most_work)
     effort.expect(_EXPECTED)
     restricted = _restricted(plant)
     coordinates = [_output(plant, k) for k in restricted]
@@ -146,7 +147,7 @@ def _witness(
     outputs: Sequence[str],
     ultimate: Sequence[str],
     near: Sequence[Mapping[str, object]],
-    progress: Callable[[float], None],
+    progress: Progress,
     most_work: float,
 ) -> Witness:
     equations, loop = _on(plant, widths)
@@ -155,7 +156,7 @@ def _witness(
         outputs,
         ultimate=ultimate,
         near=near,
-        progress=lambda share: progress((1 + share) / 2),
+        progress=part_of(progress, 0.5, 1.0),
         most_work=most_work,
     )
     region = region_table(widths, plant.states)
