@@ -1,4 +1,4 @@
-"""Findings on a machine, from its measurements: their meaning for a run, remedies, a table.
+"""Findings on a machine, from its measurements: their meaning for a run, and remedies.
 
 A check is a function with the decorator ``_check``; it yields a verdict for each thing it found.
 """
@@ -8,11 +8,9 @@ from dataclasses import asdict
 from enum import StrEnum
 from typing import NamedTuple
 
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
 from cosim.doctor.machine_measures import MachineFacts, RunRequirements
+from cosim.output.document import Block, Document, Sentence
+from cosim.output.result_tables import ResultTable, Tone
 from noack.core.number_format import byte_size, duration
 
 LOOP_PROCESSES = 5
@@ -62,11 +60,11 @@ class MachineFinding(NamedTuple):
 
 GOOD, LIMITED, BAD = MachineVerdict
 _VERDICTS = {
-    GOOD: ("green", "ready"),
-    LIMITED: ("yellow", "ready, with the limits above"),
-    BAD: ("bold red", "not ready: no run is possible"),
+    GOOD: (Tone.GOOD, "ready"),
+    LIMITED: (Tone.DOUBTFUL, "ready, with the limits above"),
+    BAD: (Tone.BAD, "not ready: no run is possible"),
 }
-"""Colour of a finding; verdict on the machine if this is the worst finding."""
+"""Tone of a finding; verdict on the machine if this is the worst finding."""
 
 
 Outcome = tuple[MachineVerdict, *tuple[str, ...]]
@@ -241,31 +239,25 @@ def _viewer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
         yield LIMITED, f"{text}, no display", means, remedy
 
 
-def document(
+def findings_document(
     machine: MachineFacts, required: RunRequirements, findings: Sequence[MachineFinding]
-) -> dict[str, object]:
-    """Return ``verdict``, ``findings``, and the numbers behind them, for JSON."""
-    return {
+) -> Document:
+    """Return each finding, its meaning for a run, and a remedy; for JSON also the numbers behind them."""
+    rows = [(finding.verdict, finding.what, _lines(finding)) for finding in findings]
+    tone, verdict = _VERDICTS[worst(findings)]
+    data = {
         "scenario": asdict(required),
         "verdict": worst(findings),
         "findings": [finding._asdict() for finding in findings],
         "measured": asdict(machine),
     }
+    blocks: list[Block] = [
+        ResultTable("", "", (), rows, tones={kind: tone for kind, (tone, _) in _VERDICTS.items()}),
+        Sentence(text=f"this machine, for {required.name}: {verdict}", tone=tone),
+    ]
+    return Document(title=required.name, data=data, blocks=blocks)
 
 
-def print_findings(console: Console, required: RunRequirements, findings: Sequence[MachineFinding]) -> None:
-    """Print each finding, its meaning for a run, and a remedy."""
-    table = Table.grid(padding=(0, 2))
-    table.add_column(no_wrap=True)
-    table.add_column(max_width=26)
-    table.add_column(ratio=1)
-    for finding in findings:
-        text = Text(finding.found)
-        if finding.means:
-            text.append(f"\n{finding.means}", "" if finding.verdict is not GOOD else "dim")
-        if finding.remedy:
-            text.append(f"\n→ {finding.remedy}", "cyan")
-        table.add_row(Text(finding.verdict, _VERDICTS[finding.verdict][0]), Text(finding.what), text)
-    console.print(table)
-    colour, verdict = _VERDICTS[worst(findings)]
-    console.print(Text.assemble("this machine, for ", required.name, ": ", (verdict, colour)))
+def _lines(finding: MachineFinding) -> str:
+    remedy = f"→ {finding.remedy}" if finding.remedy else ""
+    return "\n".join(filter(None, (finding.found, finding.means, remedy)))

@@ -3,8 +3,7 @@
 ``loop_flows.py`` has the loop from event to event, with the objective. ``pattern_search.py`` has the
 methods that search among its patterns, ``worst_disturbances.py`` the worst disturbances for a given
 pattern. ``scenario_search.py`` applies both to a scenario and its certificate; ``simulated_search.py``
-searches the patterns of plants that are not given by matrices; ``worst_run.py`` has the result, and
-reports it.
+searches the patterns of plants that are not given by matrices; ``worst_run.py`` has the result.
 """
 
 from cosim.analysis.adversary.loop_flows import Objective

@@ -1,14 +1,10 @@
-"""The result of a replay: by process, by flow of messages, the first difference; and its table."""
+"""The result of a replay: by process, by flow of messages, and the first difference."""
 
 import math
 import struct
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from cosim.analysis.summary.summary_model import ReplayDifference, ReplayPart, SummaryPart
 from noack.protocol.record_tables import entry_names
@@ -156,35 +152,3 @@ class ReplayResult(SummaryPart):
         """Return the complete result for JSON."""
         verdict = self.verdict().model_dump(exclude={"error"})
         return verdict | {"gaps": self.gaps} | self.model_dump()
-
-
-def print_replay(console: Console, replay: ReplayResult, changed: Sequence[str]) -> None:
-    """Print the result of a replay, and what ``changed`` since the run on its computer."""
-    table = Table(title="replay, compared bit for bit")
-    for heading in ("process or hop", "recorded", "compared", "verdict"):
-        table.add_column(heading, justify="left" if heading == "process or hop" else "right")
-    rows = [(part.process, part.inputs, part.compared, part.difference) for part in replay.processes]
-    rows += [(part.hop, part.received, part.compared, part.difference) for part in replay.messages]
-    for name, recorded, compared, difference in rows:
-        table.add_row(name, f"{recorded:,}", f"{compared:,}", _verdict(compared, difference))
-    console.print(table)
-    lines = [f"[bold yellow]record incomplete:[/] {escape(gap)}" for gap in replay.gaps]
-    if (first := replay.first_difference) is None:
-        word = f"bit-exact: {replay.inputs:,} inputs" if replay.inputs else "nothing to compare"
-        lines.append(word + (" so far as the record goes" if replay.gaps else ""))
-    else:
-        lines.append(f"[bold red]first difference:[/] {escape(str(first))}")
-        lines += [
-            f"[bold yellow]not the machine of the run:[/] {escape(change)}; "
-            "the last bits of a product may depend on it"
-            for change in changed
-        ]
-    for line in lines:
-        console.print(line, highlight=False, soft_wrap=True)
-
-
-def _verdict(compared: int, difference: ReplayDifference | None) -> str:
-    if difference is not None:
-        cell = f"{difference.table}[{difference.row}].{difference.column}".rstrip(".")
-        return f"[red]≠[/] {escape(cell)}"
-    return "bit-exact" if compared else "-"

@@ -7,7 +7,7 @@ from typer import Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import FILES, examples
-from cosim.cli.printing import console, print_json, status
+from cosim.cli.printing import show, status
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import ExitStatus
 
@@ -55,9 +55,6 @@ def doctor(
     with status("measuring"):
         machine = measure(resolved, required, runs, seconds)
     results = findings.find_all(machine, required)
-    if json:
-        print_json(findings.document(machine, required, results))
-    else:
-        findings.print_findings(console(), required, results)
+    show(findings.findings_document(machine, required, results), json=json)
     is_bad = findings.worst(results) is findings.MachineVerdict.BAD
     return ExitStatus.FAILED if is_bad else ExitStatus.OK

@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import RUNS, examples
-from cosim.cli.printing import console, print_json, print_lines, show, status, write_tables
+from cosim.cli.printing import print_json, print_lines, show, status, write_tables
 from cosim.output.figures.figure_format import requested_files
 from cosim.record.run_directory import (
     DEFAULT_RUNS,
@@ -143,19 +143,15 @@ def replay(
 
     Takes about a second.
     """
-    from cosim.analysis.replay.replay_result import print_replay
     from cosim.analysis.replay.run_replay import replay_run
+    from cosim.output.replay_report import replay_document
     from cosim.record.run_directory import changed_since
     from cosim.record.run_record import load_run
 
     path = chosen_run(run_dir, runs)
     with status("replaying"):
         result = replay_run(load_run(path), loop)
-    changed = changed_since(path)
-    if json:
-        print_json(result.to_json() | {"changed_since": changed})
-    else:
-        print_replay(console(), result, changed)
+    show(replay_document(result, changed_since(path)), json=json)
     return ExitStatus.OK if result.bit_exact else ExitStatus.FAILED
 
 

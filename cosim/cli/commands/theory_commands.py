@@ -9,7 +9,7 @@ from typer import Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import THEORY, examples
-from cosim.cli.printing import console, print_json, show, status, status_of
+from cosim.cli.printing import show, status, status_of
 from cosim.output.requirement import Requirement
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
@@ -176,8 +176,9 @@ def adversary(
     that is not given by matrices, some hundred patterns are simulated.
     """
     from cosim.analysis import adversary as adversary_search
-    from cosim.analysis.adversary.worst_run import BREACH, WorstRun, document, print_worst
+    from cosim.analysis.adversary.worst_run import BREACH, WorstRun
     from cosim.live.monitoring.progress import search_activity
+    from cosim.output.adversary_report import adversary_document
     from cosim.simulation.sampled_loop import SampledLoop
     from noack.scenario.resolution import resolve
 
@@ -220,10 +221,7 @@ def adversary(
         if not worst_cases:
             raise
         stopped = stop
-    if json:
-        print_json(document(worst_cases, resolved, certificate, shares))
-    else:
-        print_worst(console(), worst_cases, resolved, certificate, shares)
+    show(adversary_document(worst_cases, resolved, certificate, shares), json=json)
     if stopped is not None:
         missing = ", ".join(aim.value for aim in aims[len(worst_cases) :])
         print_to_stderr(f"noack: {stopped}; missing: {missing}")

@@ -1,5 +1,6 @@
 """From measured values to findings, independent of the machine."""
 
+import io
 import json
 import re
 import socket
@@ -8,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 from typer.testing import Result
 
-from cosim.doctor.findings import MachineFinding, MachineVerdict, find_all, worst
+from cosim.doctor.findings import MachineFinding, MachineVerdict, find_all, findings_document, worst
 from cosim.doctor.machine_measures import Buffer, Disk, Lateness, MachineFacts, RunRequirements, lateness
+from cosim.output.terminal_writer import print_document
 from tests.helpers.command_line import invoke
 
 WANTED = RunRequirements(
@@ -93,6 +96,21 @@ def test_every_finding_is_documented() -> None:
     titles = {finding.what for finding in find_all(IDEAL, WANTED)}
     assert all(any(title.startswith(name) for name in names) for title in titles)
     assert all(any(title.startswith(name) for title in titles) for name in names)
+
+
+def test_the_text_has_each_finding_with_its_meaning_and_remedy() -> None:
+    machine = replace(IDEAL, cores=1, ports_taken=("plant: UDP port 47001 is taken",))
+    results = find_all(machine, WANTED)
+    document = findings_document(machine, WANTED, results)
+    print_document(Console(file=(file := io.StringIO()), width=200), document)
+    *lines, last = [line.strip() for line in file.getvalue().splitlines()]
+    assert len(lines) == sum(1 + bool(finding.means) + bool(finding.remedy) for finding in results)
+    place = lines.index("bad      ports of loop       plant: UDP port 47001 is taken")
+    assert lines[place + 1 : place + 3] == [
+        "loop cannot run on its configured ports",
+        "→ stop the program that uses the port, or `--set ports={}`",
+    ]
+    assert last == "this machine, for loop: not ready: no run is possible"
 
 
 def test_lateness_statistics_are_those_of_the_sample() -> None:
