@@ -1,6 +1,10 @@
 """The core in C (native/): its functions, its handles, and numpy's row types of its structures.
 
 The library is built ahead of time, by ``make setup`` or with the wheel. Nothing is compiled here.
+
+The structures of most handles are public, since Python reads and writes fields of them between two
+calls: it takes rows and counters, answers what a step has asked, and sets descriptors, limits and new
+settings. Python needs no field of the exact simulation and of the transitions: these are opaque.
 """
 
 import math
