@@ -1,7 +1,9 @@
 """Places of the panels of a figure, in inches, and their legends.
 
 A figure is drawn for its width, not scaled to it: texts keep a size that one can read. Margins are
-constants: matplotlib's layout engines would double the time of a report.
+constants, and the height of a figure follows from the heights of its axes: matplotlib's layout engines
+fit axes into a figure of a given height. With them a report of 20 s took 10 % (constrained) or 22 %
+(tight) more CPU time.
 """
 
 import re
