@@ -20,7 +20,7 @@ from noack_check.growth import prove_growth, read_periodic_loop
 from noack_check.keys import RefusedError, Table
 from noack_check.proof import prove
 from noack_check.scenario import output_names, read_enclosed, read_loop
-from noack_check.sentences import assumptions, equations_text, growth_sentences, origin_text, sentences
+from noack_check.sentences import assumptions, equations_text, growth_sentences, meaning, sentences
 
 _PLANTS = {"own": "its plant", "box": "all plants of its uncertainty box", "region": "its plant's equations"}
 _CONDITIONS = {"ideal": "ideal conditions", "schedule": "its schedule"}
@@ -70,9 +70,11 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
     scenario, statements = file.get("scenario"), file.get("statements")
     if not isinstance(scenario, Mapping) or not isinstance(statements, list) or not statements:
         raise RejectedError("the file has no scenario, or no statements")
-    if given is not None and given != scenario:
-        different = sorted(key for key in {*given, *scenario} if given.get(key) != scenario.get(key))
-        raise RejectedError(f"the witness is of another scenario, by its {', '.join(different[:_MOST_KEYS])}")
+    if given is not None and (different := _differences(given, scenario)):
+        raise RejectedError(
+            f"the witness is of another scenario, by its {', '.join(different[:_MOST_KEYS])}; "
+            "--scenario takes what `noack check NAME --resolved` prints"
+        )
     scenario = scenario if given is None else given
     name = scenario.get("name")
     if not isinstance(name, str) or not name.isprintable() or len(name) > _LONGEST_NAME:
@@ -96,11 +98,17 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
         loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal", enclosed=enclosed)
         for sentence in sentences(prove(loop, document), output_names(scenario)):
             yield f"PROVED {of}: {sentence}"
-        if origin := origin_text(scenario, loop):
-            yield f"       where {origin}"
+        if meant := meaning(scenario, loop):
+            yield f"       where {meant}"
         yield f"       if there are {assumptions(scenario, loop)}"
         if enclosed is not None:
             yield f"       and the plant is {equations_text(document)}"
+
+
+def _differences(given: Table, scenario: Table) -> list[str]:
+    """Return the keys by which two scenarios differ; the text that describes them is not compared."""
+    keys = {*given, *scenario} - {"description"}
+    return sorted(key for key in keys if given.get(key) != scenario.get(key))
 
 
 class UnreadableError(ValueError):

@@ -78,7 +78,8 @@ from noack_check.responses import Decay, Response, norm_of, responses, responses
 
 Form = Mapping[str, arb]
 """Σ coefficient · signal, by the signals' names; "1" is the constant 1."""
-_NO_BOUND = "gains: too large for a bound"  # the spectral radius of F is not proven to be below 1
+_NO_BOUND = "gains: what losses and delays add to the errors may feed on itself, without a bound"
+"""The spectral radius of F is not proven to be below 1."""
 _ROOM = 1e-9
 """By so much, relatively, y exceeds the solution of y = Fy + g."""
 _MOST_TESTS = 1_000_000

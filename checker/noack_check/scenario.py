@@ -793,8 +793,10 @@ def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | No
         if rows != model[key] or any(map(any, half)):
             raise RefusedError(f"plant.{key}: with an observer only plants with model.{key} are covered")
     n, schedule = len(plants.A), read_schedule(resolved)
-    if ideal or not schedule.is_whole:
-        raise RefusedError("observer: not covered without tests a whole number of nanoseconds apart")
+    if not schedule.is_whole:
+        raise RefusedError("plant.rate_hz, controller.rate_hz: with an observer the periods are whole ns")
+    if ideal:
+        raise RefusedError("observer: ideal conditions, with tests at all times, are not covered")
     x_0, rows = _row(plant, "plant.initial_state"), _measured(resolved, n)
     C = matrix(rows)
     estimate = _row(observer, "observer.initial_estimate") if "initial_estimate" in observer else [0.0] * n

@@ -38,6 +38,9 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
         if times.period > 0:
             least = f"{ms['least_period']} to " if times.least_period < times.period else ""
             parts.append(f"events every {least}{ms['period']}")
+    plant = scenario.get("plant")
+    if loop.noise.ncols() or (isinstance(plant, Mapping) and plant.get("disturbances")):
+        parts.append("noise and disturbances within the scenario's bounds")
     if _may_accumulate(loop):
         parts.append("as long as events do not accumulate")
     if loop.until is not None:
@@ -62,13 +65,17 @@ def _may_accumulate(loop: Loop) -> bool:
     return not (rule.floor > noise or (rule.rate == 0 and rule.level > noise))
 
 
-def origin_text(scenario: Mapping[str, object], loop: Loop) -> str:
-    """Return from where x and outputs count, in words; empty: from 0."""
-    if loop.loads:
-        return "x and outputs count from where the loop rests under its constant loads"
-    controller = scenario.get("controller")
+def meaning(scenario: Mapping[str, object], loop: Loop) -> str:
+    """Return from where x and outputs count, and of what the errors are, where it is not plain."""
+    parts, controller = [], scenario.get("controller")
     is_moved = isinstance(controller, Mapping) and "reference" in controller
-    return "x and outputs count from the set-point" if is_moved and loop.until is None else ""
+    if loop.loads:
+        parts.append("x and outputs count from where the loop rests under its constant loads")
+    elif is_moved and loop.until is None:
+        parts.append("x and outputs count from the set-point")
+    if loop.observer is not None or loop.noise.ncols():
+        parts.append("e_s and e_c are x_s − x and x_c − x, not those about what the sensor takes for x")
+    return ", and ".join(parts)
 
 
 def equations_text(document: Mapping[str, object]) -> str:

@@ -145,14 +145,15 @@ def simulate_continuously(loaded: Scenario, *, json: bool, required: "Sequence[R
     return status_of(unmet_by_exact_run(summary, required), summary.exit_status)
 
 
-_COMPLETING = "replaying the run, checking its claims, writing its report"
+_COMPLETING = "replaying the run, checking its claims"
+_WITH_REPORT = f"{_COMPLETING}, writing its report"
 
 
 def reopen_run(run_dir: Path) -> "Outcome":
     """Return the outcome of an earlier run; show that its record is completed, if that is necessary."""
     from cosim.live.finalize import reopen
 
-    with status(f"{run_dir}: {_COMPLETING}"):
+    with status(f"{run_dir}: {_WITH_REPORT}"):
         return reopen(run_dir)
 
 
@@ -171,7 +172,7 @@ def finalize_run(
 
     try:
         # This takes minutes for a run of an hour.
-        with status(_COMPLETING):
+        with status(_WITH_REPORT if report else _COMPLETING):
             outcome = finalize(ending, report=report)
     except KeyboardInterrupt as error:
         error.add_note(how_to_complete(ending.run_dir))

@@ -132,11 +132,14 @@ def _doubt(lead: str, text: str) -> Sentence:
 
 def _advice(results: Certificates) -> Sentence:
     """Return that there is no certificate, and settings with which there is one."""
-    advice = _listed("; there is one", results.helpful_settings)
-    return _doubt(
-        "no certificate for the schedule,",
-        f"so no bound of ‖x‖{advice}; noack adversary shows what losses can do to it",
-    )
+    parts = ["so no bound of ‖x‖"]
+    if not results.is_searched:
+        parts.append("a search, noack certify without --no-search, may find one")
+    if settings := _listed("there is one", results.helpful_settings):
+        parts.append(settings)
+    if results.has_adversary:
+        parts.append("noack adversary shows what losses can do to it")
+    return _doubt("no certificate for the schedule,", "; ".join(parts))
 
 
 def _listed(what: str, tried: Sequence[TriedSettings]) -> str:
@@ -173,7 +176,8 @@ def _apart_in_words(certificate: ScenarioCertificate, apart_s: float) -> str:
 
 def _stability_in_words(results: Certificates) -> Iterator[str]:
     """Yield what is known exactly about the stability of a time-triggered loop."""
-    if (stability := results.stability) is None:
+    stability = results.stability
+    if stability is None or (stability.verdict == "undecided" and results.guaranteed is not None):
         return
     patterns = f"every loss pattern with {results.scenario.network.guarantee.meaning}"
     growth = f"growth per period {at_least(stability.lower)} to {at_most(stability.upper)}"

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from cosim.analysis.certificates import Certificates, state_norm
 from noack.core.number_format import counted
+from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX
@@ -20,8 +21,17 @@ def guarantee_sentence(results: Certificates) -> str | None:
     statements = _statements(results, certificate)
     plants = ", for every plant within the stated uncertainty" if certificate.scope == BOX else ""
     losses = although_lost(results.scenario)
-    until = "" if results.jump_s is None else f", until the reference jumps at {results.jump_s:g} s"
-    return f"{' and '.join(statements)}{until}{losses}{plants} (proved)"
+    return f"{' and '.join(statements)}{_until(results)}{losses}{plants} (proved)"
+
+
+def _until(results: Certificates) -> str:
+    """Return up to when a guarantee about a reference holds; empty: for ever."""
+    if results.jump_s is not None:
+        return f", until the reference jumps at {results.jump_s:g} s"
+    reference = loop_of(results.scenario).reference
+    if reference is None or reference.is_constant:
+        return ""
+    return f", up to {results.scenario.horizon_s:g} s"
 
 
 def _statements(results: Certificates, certificate: ScenarioCertificate) -> Sequence[str]:

@@ -16,7 +16,7 @@ from noack_check.document import read_number
 from noack_check.keys import RefusedError
 from noack_check.proof import Bound, conclude, prove, prove_bound, read_assumptions
 from noack_check.scenario import read_loop
-from noack_check.sentences import origin_text
+from noack_check.sentences import meaning
 from tests.checker.runs import floats
 from tests.helpers.resolved_tables import resolved_tables
 from tests.helpers.shipped import resolved, shipped
@@ -134,9 +134,9 @@ def test_the_sentences_say_from_where_they_count(statement: WitnessedStatement) 
     lines = [*check_file({"scenario": motor(), "statements": [statement.document]}, None)]
     assert any("where the loop rests under its constant loads" in line for line in lines)
     loop = read_loop(resolved_tables("double_integrator"), box=False, ideal=False)
-    assert origin_text(resolved_tables("double_integrator"), loop) == ""
+    assert meaning(resolved_tables("double_integrator"), loop) == ""
     tables = resolved_tables("double_integrator", "controller.setpoint=[0.5,0.0]")
-    assert origin_text(tables, loop) == "x and outputs count from the set-point"
+    assert meaning(tables, loop) == "x and outputs count from the set-point"
 
 
 def test_no_simulated_run_exceeds_it(statement: WitnessedStatement) -> None:

@@ -11,6 +11,9 @@ from cosim.cli.application import app
 from noack.core.errors import ExitStatus
 from noack_check.__main__ import check_file, main
 from noack_check.check import RejectedError
+from noack_check.scenario import read_loop
+from noack_check.sentences import assumptions, meaning
+from tests.helpers.resolved_tables import resolved_tables
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +88,21 @@ def test_another_scenario_is_told_apart(
     assert run(capsys, monkeypatch, str(file), "--scenario", str(given))[0] == 0
     given.write_text(resolved.replace("mansd = 3", "mansd = 4"))
     status, text = run(capsys, monkeypatch, str(file), "--scenario", str(given))
-    assert (status, text) == (1, "REJECTED the witness is of another scenario, by its network\n")
+    what = "--scenario takes what `noack check NAME --resolved` prints"
+    assert (status, text) == (1, f"REJECTED the witness is of another scenario, by its network; {what}\n")
+
+
+def test_a_description_proves_nothing(file: Path) -> None:
+    content = json.loads(file.read_text())
+    given = {**content["scenario"], "description": "another text"}
+    assert any(line.startswith("PROVED") for line in check_file(content, given))
+
+
+def test_noise_is_an_assumption_and_errors_are_about_x() -> None:
+    tables = resolved_tables("pendulum_observed")
+    loop = read_loop(tables, box=False, ideal=False)
+    assert "noise and disturbances within the scenario's bounds" in assumptions(tables, loop)
+    assert "e_s and e_c are x_s − x and x_c − x" in meaning(tables, loop)
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ def certify(
         require_covered(resolve(loaded))
     with uncovered_as_unmet(require or ()):
         result = certificates_of(loaded, late)
-    with work_bar("searching for proofs", lines=True) as bar:
+    with work_bar("searching for proofs" if search else "proving", lines=True) as bar:
         witnesses = result.prove(bar, MOST_WORK if search else 0.0)
     if witness is not None and witnesses.are_any:
         write_output(witness, witnesses.file_text())
@@ -116,7 +116,7 @@ def certify(
     if out is not None:
         save_mat(result.to_json(), out)
     if witness is not None and not witnesses.are_any:
-        status("no witness was found; no file is written")
+        print_to_stderr(f"noack: no witness was found; {witness} is not written")
         return ExitStatus.FAILED
     if require:
         return status_of(unmet_by_scenario(result, require))

@@ -59,6 +59,23 @@ class _SparseLines:
 
 
 @contextmanager
+def _line_at_intervals(line: Callable[[], str], *, printed: bool) -> Iterator[None]:
+    """Print a line every ``_LINE_EVERY_S`` while the context lasts, whatever it does."""
+    has_ended = Event()
+
+    def print_lines() -> None:
+        while not has_ended.wait(_LINE_EVERY_S):
+            print_to_stderr(f"noack: {line()}")
+
+    if printed:
+        Thread(target=print_lines, daemon=True).start()
+    try:
+        yield
+    finally:
+        has_ended.set()
+
+
+@contextmanager
 def activity(text: str) -> Iterator[Callable[[str], None]]:
     """Show what is done and for how long, while the context lasts; yields what changes the text.
 
@@ -74,19 +91,12 @@ def activity(text: str) -> Iterator[Callable[[str], None]]:
             text = new_text
             progress.update(task, description=text)
 
-        def print_lines() -> None:
-            began_s = time.monotonic()
-            while not has_ended.wait(_LINE_EVERY_S):
-                print_to_stderr(f"noack: {text}, {time.monotonic() - began_s:.0f} s")
+        def line() -> str:
+            return f"{text}, {time.monotonic() - began_s:.0f} s"
 
-        has_ended = Event()
-        printer = Thread(target=print_lines, daemon=True)
-        if not console.is_terminal:
-            printer.start()
-        try:
+        began_s = time.monotonic()
+        with _line_at_intervals(line, printed=not console.is_terminal):
             yield change
-        finally:
-            has_ended.set()
 
 
 @contextmanager
@@ -95,20 +105,25 @@ def work_bar(description: str, *, lines: bool = False) -> Iterator[Progress]:
 
     Where there is no terminal, print them as a line at intervals if ``lines``.
     """
-    console = error_console()
-    sparse_lines = _SparseLines(console)
+    console, share, began_s = error_console(), 0.0, time.monotonic()
     columns = TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()
-    with _bar(console, 1.0, *columns, description=description) as update:
+
+    def line() -> str:
+        spent_s = time.monotonic() - began_s
+        if not 0 < share < 1:
+            return f"{description}: {spent_s:.0f} s"
+        left = f", about {spent_s / share - spent_s:.0f} s left" if share >= _LEAST_SHARE else ""
+        return f"{description}: {100 * share:.0f} % after {spent_s:.0f} s{left}"
+
+    with (
+        _bar(console, 1.0, *columns, description=description) as update,
+        _line_at_intervals(line, printed=lines and not console.is_terminal),
+    ):
 
         def show(done: float, total: float = 1.0, /) -> None:
+            nonlocal share
             share = done / total
             update(completed=share)
-            if lines and 0 < share < 1:
-                spent_s = sparse_lines.spent_s
-                line = f"{description}: {100 * share:.0f} % after {spent_s:.0f} s"
-                if share >= _LEAST_SHARE:
-                    line += f", about {spent_s / share - spent_s:.0f} s left"
-                sparse_lines.print(line)
 
         yield show
 

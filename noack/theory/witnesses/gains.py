@@ -100,6 +100,8 @@ def find_by_gains(loop: Loop, outputs: Sequence[str]) -> dict[str, object]:
     Raises:
         NoWitnessError: nothing is proven by gains.
     """
+    if loop.loads:
+        raise NoWitnessError("model.load: gains do not cover loads, a search may")
     reason = "the loop does not decay without losses"
     for rate in rates_by_gains(loop):
         try:
@@ -138,12 +140,12 @@ def _comparison(loop: Loop) -> dict[str, object]:
     """Return Y, J and S: the square of the rule's form on (x, e_s) is completed."""
     n, P, N = loop.n, floats(loop.rule.positive), floats(loop.rule.negative)
     if P.shape[1] != 2 * n:
-        raise NoWitnessError("the rule is none of x and e_s")
+        raise NoWitnessError("trigger.policy: gains need a rule that compares only x and e_s")
     Q = P.T @ P - N.T @ N
     of_errors, cross = Q[n:, n:], Q[n:, :n]
     values = np.linalg.eigvalsh(of_errors)
     if not values[0] > 1e-9 * abs(values[-1]):
-        raise NoWitnessError("where the rule does not transmit, e_s may still have any size")
+        raise NoWitnessError("trigger: where the rule does not transmit, e_s may still have any size")
     Y = np.sqrt(1 - _SLACK) * np.linalg.cholesky(of_errors).T
     J = np.linalg.solve(of_errors, cross)
     values, vectors = np.linalg.eigh(cross.T @ J - Q[:n, :n])

@@ -18,9 +18,11 @@ from cosim.output.certificate_report import certificate_document, certificate_ta
 from cosim.output.document import Sentence
 from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate
+from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
 from noack.theory.certificates.conditions import allowed_conditions, outside_box
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
+from noack.theory.witnesses.loss_margin import Stability
 from noack_check.sentences import smallest_bounds
 from tests.helpers.approved import compare_text
 from tests.helpers.command_line import invoke
@@ -248,14 +250,36 @@ def test_the_first_screen_is_a_sentence_and_a_few_lines() -> None:
     cases = {
         "stated outputs": with_proofs(Certificates(resolved("unstable_pendulum", outputs)), own, box),
         "the states": with_proofs(Certificates(resolved("unstable_pendulum")), own),
-        "no certificate": with_proofs(Certificates(resolved("unstable_pendulum", LATE)), none),
+        "no certificate, by a search": with_proofs(Certificates(resolved("unstable_pendulum", LATE)), none),
+        "no certificate, without a search": with_proofs(Certificates(resolved("cart_pole")), none),
     }
+    cases["no certificate, by a search"].is_searched = True
     cases["stated outputs"].threshold_advice["rate"] = "trigger.floor = 0.0001 is small enough (proved)"
     text = ""
     for name, certificates in cases.items():
         assert len(certificate_document(certificates).blocks) <= 11
         text += f"# {name}\n{printed(certificates, verbose=False)}"
     compare_text(Path(__file__).with_name("first_screens.txt"), text)
+
+
+def test_a_witness_that_is_not_found_is_said(tmp_path: Path) -> None:
+    file = tmp_path / "none.json"
+    result = invoke("certify", "cart_pole", "--no-search", "--witness", str(file))
+    assert result.exit_code == ExitStatus.FAILED
+    assert f"no witness was found; {file} is not written" in result.stderr
+    assert not file.exists()
+
+
+def test_a_guarantee_about_a_reference_ends_with_the_run() -> None:
+    results = with_proofs(Certificates(resolved("servo_reference")), ("own", "schedule", PROVEN))
+    assert ", up to 16 s, although" in printed(results)
+
+
+def test_what_is_proven_leaves_nothing_undecided() -> None:
+    results = Certificates(resolved("lane_periodic"))
+    results.__dict__["stability"] = Stability(0.9, 1.1, (True,), (0.05,))
+    assert "Not decided whether" in printed(with_proofs(results, ("own", "schedule", None)))
+    assert "Not decided whether" not in printed(with_proofs(results, ("own", "schedule", PROVEN)))
 
 
 def test_the_table_has_the_bounds_of_what_is_proven() -> None:

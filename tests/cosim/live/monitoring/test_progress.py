@@ -1,0 +1,44 @@
+"""What long work prints where there is no terminal."""
+
+import re
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+import pytest
+
+from cosim.live.monitoring import progress
+
+MOST_S = 60.0
+
+
+@pytest.mark.parametrize(
+    "work",
+    [lambda: progress.work_bar("proving", lines=True), lambda: progress.activity("proving")],
+    ids=["work_bar", "activity"],
+)
+def test_long_work_is_not_silent_though_it_reports_nothing(
+    work: Callable[[], AbstractContextManager[object]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(progress, "_LINE_EVERY_S", 0.01)
+    printed, ends_s = "", time.monotonic() + MOST_S
+    with work():
+        while "\n" not in printed and time.monotonic() < ends_s:
+            time.sleep(0.01)
+            printed += capsys.readouterr().err
+    assert printed.startswith("noack: proving")
+
+
+def test_the_remaining_time_follows_from_the_share(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "_LINE_EVERY_S", 0.01)
+    printed, ends_s = "", time.monotonic() + MOST_S
+    with progress.work_bar("proving", lines=True) as show:
+        show(1.0, 4.0)
+        while " left\n" not in printed and time.monotonic() < ends_s:
+            time.sleep(0.01)
+            printed += capsys.readouterr().err
+    assert re.search(r"noack: proving: 25 % after \d+ s, about \d+ s left", printed)
