@@ -235,6 +235,8 @@ def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort) -> Witness:
     by_tests = not loop.times.period > 0
     if loop.rule.memory is not None and loop.losses:
         raise NoWitnessError("with losses quadratic forms are not known for a rule with a dynamic variable")
+    if loop.rule.memory is not None and loop.holds:  # x_s rests, and where xᵀPB = 0 K e_s may have any size
+        raise NoWitnessError("trigger.policy: a dynamic rule bounds no held input; one with a deadline does")
     fastest = min((each["rate"] for each in wanted.near if isinstance(each["rate"], float)), default=math.inf)
     for pieces in _PIECES_OF_TESTS if by_tests else _PIECES:
         for rates in (_Rates(loop, slow=share, by_tests=by_tests) for share in (0.3, 0.02)):
