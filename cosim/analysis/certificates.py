@@ -10,7 +10,6 @@ from cosim.analysis.certificate_rows import certificate_rows, covered_plants
 from cosim.analysis.scenario_certificates import certificate_of
 from cosim.analysis.tried_settings import TriedSettings, helpful_box, helpful_settings, largest_settings
 from cosim.analysis.witnesses import Unproven, Witnesses, find_witnesses, with_lateness
-from cosim.simulation.sampled_loop import SampledLoop
 from noack.core.errors import CallerError
 from noack.core.number_checks import whole_number
 from noack.core.number_format import TextRows, as_html, as_text
@@ -223,17 +222,6 @@ class Certificates:
         with contextlib.suppress(CallerError):
             return LossMargin(self.scenario).first_bounds()
         return None
-
-    @property
-    def has_adversary(self) -> bool:
-        """Whether ``noack adversary`` covers the loop, as it is without a certificate."""
-        if not self.scenario.coverage.is_linear:
-            return False
-        try:
-            SampledLoop(self.scenario)
-        except CallerError:
-            return False
-        return True
 
     def to_json(self) -> dict[str, object]:
         """Return all certificates as one document, as ``noack certify --json`` prints it."""

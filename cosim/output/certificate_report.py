@@ -16,8 +16,11 @@ from cosim.output.document import Block, Document, Sentence, SentenceRole
 from cosim.output.guarantee_sentence import guarantee_sentence
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
+from cosim.simulation.sampled_loop import SampledLoop
+from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most, duration_at_least, number
 from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import EQUATIONS, outside_box
@@ -137,9 +140,20 @@ def _advice(results: Certificates) -> Sentence:
         parts.append("a search, noack certify without --no-search, may find one")
     if settings := _listed("there is one", results.helpful_settings):
         parts.append(settings)
-    if results.has_adversary:
+    if _is_searched_for_losses(results.scenario):
         parts.append("noack adversary shows what losses can do to it")
     return _doubt("no certificate for the schedule,", "; ".join(parts))
+
+
+def _is_searched_for_losses(resolved: Scenario) -> bool:
+    """Return whether ``noack adversary`` covers a loop that has no certificate."""
+    if not resolved.coverage.is_linear:
+        return False
+    try:
+        SampledLoop(resolved)
+    except CallerError:
+        return False
+    return True
 
 
 def _listed(what: str, tried: Sequence[TriedSettings]) -> str:
