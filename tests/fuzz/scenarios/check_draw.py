@@ -49,6 +49,8 @@ _NODES, _BEAM, _PAPER_PATTERNS = 400, 8, 10
 """Effort of the adversary, for each objective; patterns that are tried in the paper's loop."""
 _MOST_FINDINGS = 5
 """Findings of a run that the model does not explain that are listed."""
+_PROGRESS = "noack: checking claims"
+"""How lines about long work begin, which are no warnings."""
 _MOST_ENTRIES = 2
 """Entries of [[loops]] whose loop is certified and attacked."""
 TOO_LONG = ": search too long"
@@ -164,8 +166,9 @@ class Checks:
         warned = io.StringIO()
         with self.step("finalize", may_refuse=False, searches=True), contextlib.redirect_stderr(warned):
             summary = finalize(ending, report=False, view=False).summary
-            if warned.getvalue():
-                self.add("finalize", warned.getvalue())
+            warnings = [line for line in warned.getvalue().splitlines() if not line.startswith(_PROGRESS)]
+            if warnings:
+                self.add("finalize", "\n".join(warnings))
             for loop in summary.loops:
                 if loop.unintended_losses:
                     self.add("simulate", f"{loop.name}: {loop.unintended_losses} unintended losses")
