@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat
 
-from noack_check.balls import beside, columns_of, frobenius, identity, is_positive, is_zero, transpose, upto
+from noack_check.balls import beside, columns_of, frobenius, identity, is_positive, is_zero, square, transpose, upto
 from noack_check.check import RejectedError
 from noack_check.norms import spectral_norm
 
@@ -147,16 +147,15 @@ def _norms(outputs: Sequence[arb_mat], Z: arb_mat, parts: Sequence[range]) -> li
     found = []
     for CZ in (C * Z for C in outputs):
         if CZ.nrows() == 1:  # most are: their norms of single columns are sizes of entries
-            row = CZ.entries()
-            sizes = [abs(row[p.start]) if len(p) == 1 else norm_of(columns_of(CZ, p)) for p in parts]
+            columns = [abs(entry) for entry in CZ.entries()]
         else:
-            sizes = [norm_of(columns_of(CZ, part)) for part in parts]
-        found.append(sizes)
+            squares = square(CZ)
+            columns = [upper(squares[k, k]).sqrt() for k in range(CZ.ncols())]
+        found.append([columns[p.start] if len(p) == 1 else norm_of(columns_of(CZ, p)) for p in parts])
     return found
 
 
 def _sizes(P: arb_mat, Z: arb_mat, parts: Sequence[range]) -> list[arb]:
     """Return upper bounds of √(trace zᵀPz) of some columns each."""
-    PZ, n = P * Z, Z.nrows()
-    squares = [sum((Z[i, k] * PZ[i, k] for i in range(n)), arb(0)) for k in range(Z.ncols())]
-    return [upper(arb(sum((squares[k] for k in part), arb(0)).abs_upper()).sqrt()) for part in parts]
+    squares = transpose(Z) * (P * Z)
+    return [upper(upper(sum((squares[k, k] for k in part), arb(0))).sqrt()) for part in parts]
