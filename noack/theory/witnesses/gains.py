@@ -4,6 +4,7 @@ Nothing here has to be right: :mod:`noack_check.gains` solves the inequalities a
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -102,29 +103,41 @@ def find_by_gains(loop: Loop, outputs: Sequence[str]) -> dict[str, object]:
     """
     if loop.loads:
         raise NoWitnessError("model.load: gains do not cover loads, a search may")
-    reason = "the loop does not decay without losses"
-    for rate in rates_by_gains(loop):
-        try:
-            return {"rate": rate, "gains": find_gains(loop, rate, outputs)}
-        except NoWitnessError as error:
-            reason = str(error)
-    raise NoWitnessError(reason)
+
+    def at(rate: float) -> dict[str, object]:
+        return {"rate": rate, "gains": find_gains(loop, rate, outputs)}
+
+    largest, *smaller = rates_by_gains(loop)
+    try:
+        return at(largest)
+    except NoWitnessError:
+        if not smaller:
+            raise
+    slowest = at(smaller.pop())  # bounds grow with the rate: without any here there are none at a larger one
+    for rate in smaller:
+        with suppress(NoWitnessError):
+            return at(rate)
+    return slowest
 
 
-def rates_by_gains(loop: Loop) -> Iterator[float]:
-    """Yield rates of decay that bounds by gains may have, from the largest one."""
+def rates_by_gains(loop: Loop) -> Sequence[float]:
+    """Return rates of decay that bounds by gains may have, from the largest one.
+
+    Raises:
+        NoWitnessError: the loop does not decay without losses.
+    """
     closed, H = floats(loop.A + loop.B * loop.gain), floats(loop.H)
     falling = [closed] if loop.holds or not loop.losses else [closed, H]
     slowest = min([observer_decay(loop), *(-float(np.linalg.eigvals(M).real.max()) for M in falling)])
     level, threshold = float(loop.rule.level), float(loop.rule.rate)
     if slowest <= 0:
-        return
+        raise NoWitnessError("the loop does not decay without losses")
     largest = 0.3 * slowest
     if level:
         largest = threshold if threshold < 0.95 * slowest else 0.8 * slowest
     if (loop.holds and loop.losses) or (level and not threshold):
         largest = 0.0
-    yield from dict.fromkeys(share * largest for share in _SHARES)
+    return [*dict.fromkeys(share * largest for share in _SHARES)]
 
 
 def _lyapunov(M: Matrix, rate: float, name: str) -> dict[str, object]:
