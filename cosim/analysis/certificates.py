@@ -106,6 +106,7 @@ class Certificates:
         most_work: float = MOST_WORK,
         conditions: Sequence[str] = ("ideal", "schedule"),
         near: Sequence[Mapping[str, object]] = (),
+        plants: Sequence[str] | None = None,
     ) -> Witnesses:
         """Search for the smallest bounds that the checker proves.
 
@@ -115,9 +116,10 @@ class Certificates:
                 known already, or needs no search.
             conditions: "ideal" for the paper's conditions, and "schedule" for the scenario's own.
             near: documents of similar scenarios; the search begins near them.
+            plants: some of :func:`cosim.analysis.witnesses.plants_of`; by default all.
         """
         self.is_searched = most_work > 0
-        found = find_witnesses(self.scenario, progress, most_work, conditions, near)
+        found = find_witnesses(self.scenario, progress, most_work, conditions, near, plants)
         self._found, self.unproven = [], found.unproven
         for statement in found.statements:
             under = _UNDER[statement.conditions]

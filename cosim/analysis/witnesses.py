@@ -107,6 +107,7 @@ def find_witnesses(
     most_work: float = MOST_WORK,
     conditions: Sequence[str] = ("ideal", "schedule"),
     near: Sequence[Mapping[str, object]] = (),
+    plants: Sequence[str] | None = None,
 ) -> Witnesses:
     """Search for witnesses of a resolved scenario's bounds, for its plant and its uncertainty box.
 
@@ -116,16 +117,17 @@ def find_witnesses(
         most_work: limit of each search, see :class:`noack.theory.witnesses.effort.Effort`.
         conditions: "ideal" and "schedule", or one of them.
         near: documents of similar scenarios.
+        plants: some of :func:`plants_of`; by default all.
     """
-    wanted = [(plants, under) for under in conditions for plants in plants_of(resolved)]
+    wanted = [(of, under) for under in conditions for of in plants or plants_of(resolved)]
     found: list[WitnessedStatement] = []
-    for index, (plants, under) in enumerate(wanted):
+    for index, (of, under) in enumerate(wanted):
         part = part_of(progress, index / len(wanted), (index + 1) / len(wanted))
-        known = [*near] if plants == "region" else []  # other searches of ideal conditions are short
+        known = [*near] if of == "region" else []  # other searches of ideal conditions are short
         if under == "schedule":
-            found_near = (s for s in found if s.plants == plants or s.conditions == under)
-            known = [*near, *(s.document for s in found_near if s.document and plants != "region")]
-        found.append(find_statement(resolved, plants, under, part, most_work, known))
+            found_near = (s for s in found if s.plants == of or s.conditions == under)
+            known = [*near, *(s.document for s in found_near if s.document and of != "region")]
+        found.append(find_statement(resolved, of, under, part, most_work, known))
     progress(1.0)
     return Witnesses(resolved_content(resolved), found)
 

@@ -233,13 +233,13 @@ def adversary(
 def _certificate_to_compare(resolved: "Scenario") -> "ScenarioCertificate":
     """Return the certificate of the scenario's own plant, as ``noack certify`` proves it."""
     from cosim.analysis.certificates import Certificates
+    from cosim.analysis.witnesses import plants_of
     from cosim.live.monitoring.progress import work_bar
 
     results = Certificates(resolved)
     with work_bar("searching for proofs", lines=True) as bar:
-        results.prove(bar, conditions=("schedule",))
-    (_, certificate), *_ = results
-    return certificate
+        results.prove(bar, conditions=("schedule",), plants=plants_of(resolved)[:1])
+    return results.schedule
 
 
 @app.command(
