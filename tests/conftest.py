@@ -157,8 +157,8 @@ def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
 
     prove = Certificates.prove
 
-    def shortly(self: Certificates, *_: object, **__: object) -> "Witnesses":
-        return prove(self, most_work=0.02)
+    def shortly(self: Certificates, *_: object, **named: Any) -> "Witnesses":
+        return prove(self, **(named | {"most_work": 0.02}))
 
     monkeypatch.setattr(Certificates, "prove", shortly)
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat
 
-from noack_check.balls import beside, columns_of, frobenius, identity, is_positive, is_zero, square, transpose, upto
+from noack_check.balls import beside, columns_of, frobenius, identity, is_positive, is_zero, transpose, upto
 from noack_check.check import RejectedError
 from noack_check.norms import spectral_norm
 
@@ -149,7 +149,7 @@ def _norms(outputs: Sequence[arb_mat], Z: arb_mat, parts: Sequence[range]) -> li
         if CZ.nrows() == 1:  # most are: their norms of single columns are sizes of entries
             columns = [abs(entry) for entry in CZ.entries()]
         else:
-            squares = square(CZ)
+            squares = transpose(CZ) * CZ
             columns = [upper(squares[k, k]).sqrt() for k in range(CZ.ncols())]
         found.append([columns[p.start] if len(p) == 1 else norm_of(columns_of(CZ, p)) for p in parts])
     return found

@@ -26,7 +26,7 @@ UNENFORCED = ("--set", "network.enforce_mansd=false")
         (("lane_periodic", "--require", "stable"), []),
         (("lane_periodic", "--require", "certificate"), ["certificate: no certificate: gains: "]),
         # Certified under the paper's conditions only: without --require the status is 0.
-        (("lane_following", "--late", "1000", "--require", "certificate"), ["certificate: no certificate: "]),
+        (("unstable_pendulum", "--late", "1000", *ALL[:2]), ["certificate: no certificate: "]),
         (("cart_pole", *ALL), [f"{word}: no certificate: for all x and u: its equations"
                                for word in Requirement]),
         (("model_predictive", *ALL), [f'{word}: no certificate: controller.kind = "python": the input is not'
@@ -40,10 +40,10 @@ def test_certify_exits_with_1_unless_what_is_required_is_certified(
 ) -> None:
     result = invoke("certify", *words, "--no-search")
     assert result.exit_code == (1 if unmet else 0), result.stderr
-    lines = [line.removeprefix("noack: --require ") for line in result.stderr.splitlines()]
-    assert len(lines) == len(unmet)
+    lines = [line for line in result.stderr.splitlines() if line.startswith("noack: --require ")]
+    assert len(lines) == len(unmet)  # beside progress on a slow machine
     for line, start in zip(lines, unmet, strict=True):
-        assert line.startswith(start)
+        assert line.startswith(f"noack: --require {start}")
 
 
 @pytest.mark.parametrize(
@@ -66,8 +66,7 @@ def test_a_run_exits_with_1_unless_its_verdict_has_what_is_required(
     words: tuple[str, ...], unmet: list[str], tmp_path: Path
 ) -> None:
     command = ("simulate", *words, "--no-report", "--runs", tmp_path, "--json")
-    plain, result = invoke(*command), invoke(*command, *ALL)
-    assert plain.exit_code == 0
+    result = invoke(*command, *ALL)
     assert result.exit_code == (1 if unmet else 0)
     assert json.loads(result.stdout)["exit"]["status"] == 0  # of the run, which completed
     lines = [line for line in result.stderr.splitlines() if line.startswith("noack: --require ")]

@@ -23,7 +23,12 @@ from noack.scenario.scenario_file import load
 from tests.helpers.command_line import invoke
 
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
-LOOPS = 11
+LOOPS = (
+    'loops=[{ name = "pendulum", count = 2 }, '
+    '{ name = "periodic", trigger = { policy = "periodic", period_s = 0.2 } }]'
+)
+NARROW = 'network.impairments=[{ kind = "rate", rate_bps = 20_000, queue = 3 }]'
+"""For three loops instead of eleven."""
 ONE_LOOP = Path(__file__).parents[3] / "scenarios" / "double_integrator.toml"
 SETTINGS = ("horizon_s=2", "plant.rate_hz=100", "controller.rate_hz=100", "trigger.beta=0.05")
 
@@ -36,7 +41,7 @@ def simulated(folder: Path, *settings: str, options: Sequence[str] = ()) -> Resu
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
-    result = simulated(folder, "horizon_s=3", options=["--no-report"])
+    result = simulated(folder, "horizon_s=3", LOOPS, NARROW, options=["--no-report"])
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout) == json.loads((folder / "latest/summary.json").read_text())
     return (folder / "latest").resolve()
@@ -64,16 +69,16 @@ def test_the_counts_of_the_loops_add_up_to_those_of_the_network(run_dir: Path) -
     assert read_summary(summary) is not None
     assert read_summary(summary | {"loops": summary["loops"][::-1]}) is None
     network, loops = summary["network"], summary["loops"]
-    assert [part["number"] for part in loops] == [*range(LOOPS)]
+    assert [part["number"] for part in loops] == [0, 1, 2]
     assert sum(part["link_share"] for part in loops) == pytest.approx(1)
     for part in loops:
         record = load_record(run_dir, part["name"])
         assert part["events"] == len(record.events()) == part["deliveries"] + part["drops"]
     assert sum(part["events"] for part in loops) == network["datagrams"]
     assert sum(network["drops_by_cause"].values()) == sum(part["drops"] for part in loops)
-    # Little's law: the mean number in the network is the rate times the mean time in it.
+    # Little's law: the mean number in the network is the rate times the mean time in it, but at the ends.
     times_s = sum(part["deliveries"] * (part["delay_mean_s"] or 0.0) for part in loops)
-    assert network["in_flight"]["mean"] == pytest.approx(times_s / 3, rel=0.02)
+    assert network["in_flight"]["mean"] == pytest.approx(times_s / 3, rel=0.05)
 
 
 def test_a_run_and_each_loop_can_be_summarised_and_replayed(run_dir: Path) -> None:
@@ -86,10 +91,10 @@ def test_a_run_and_each_loop_can_be_summarised_and_replayed(run_dir: Path) -> No
         assert json.loads(replayed.stdout)["gaps"] == []
     output = invoke("summary", run_dir).stdout
     assert "bottleneck" in output
-    assert "guarantee not checkable in 1 of 11 loops: periodic: no certificate: " in output
+    assert "guarantee not checkable in 1 of 3 loops: periodic: no certificate: " in output
     result = invoke("summary", run_dir, "--loop", "x")
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
-    assert "noack: x: the run has no such loop; it has pendulum-01, " in result.stderr
+    assert "noack: x: the run has no such loop; it has pendulum-1, " in result.stderr
 
 
 def test_a_run_that_is_simulated_again_has_the_same_bits(run_dir: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from noack.scenario.scenario_file import load
 
 SCENARIO = """
 name = "mass"
-horizon_s = 20.0
+horizon_s = 12.0
 [model]
 name = "double_integrator"
 [plant]
@@ -26,7 +26,7 @@ beta = 0.5
 alpha_per_s = 0.25
 weight = [[1.5, 0.5], [0.0, 1.0]]
 [network]
-mansd = 3
+mansd = 1
 loss = { model = "bernoulli", probability = 0.6 }
 [controller]
 rate_hz = 500.0
