@@ -28,6 +28,8 @@ _MOST_SHOWN = 12
 """Reasons of refusals that are listed."""
 _EVERY_S = 10.0
 """Time between two lines of progress."""
+_WITNESSES_EVERY = 5
+"""Each of so many draws is searched for witnesses, unless all are."""
 
 
 class Totals:
@@ -83,14 +85,16 @@ def checked_draws(
 ) -> Iterator[Checked]:
     """Check draws in some processes; yield the results as they come.
 
-    If a process dies, the draws that were under way are contradictions, and the search ends.
+    Witnesses are searched for each fifth draw, or for all. If a process dies, the draws that were
+    under way are contradictions, and the search ends.
     """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, context, max_tasks_per_child=200) as pool:
         pending: dict[Future[Checked], int] = {}
         while True:
             for number in islice(numbers, processes + 1 - len(pending)):
-                future = pool.submit(check_draw, seed, number, limit_s, theory=theory, witnesses=witnesses)
+                searched = witnesses or number % _WITNESSES_EVERY == 0
+                future = pool.submit(check_draw, seed, number, limit_s, theory=theory, witnesses=searched)
                 pending[future] = number
             if not pending:
                 return
@@ -135,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--failures", type=Path, default=Path("fuzz-failures"), help="folder for failing draws"
     )
     parser.add_argument("--runs-only", action="store_true", help="no claims, certificates and adversary")
-    parser.add_argument("--witnesses", action="store_true", help="also search for witnesses")
+    parser.add_argument("--witnesses", action="store_true", help="search for witnesses of all draws, not of each fifth")
     options = parser.parse_args(arguments)
     totals, began_s = Totals(), time.monotonic()
     said_s = began_s
