@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -15,6 +16,7 @@ from pydantic import BaseModel
 from typer.main import get_command
 
 import noack
+from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.cli.application import app
 from cosim.output.page_kit import glossary
 from cosim.studies.campaign.campaign_file import Campaign, CampaignAxis, Figure, Metrics, PairedComparison
@@ -23,6 +25,7 @@ from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.metrics import METRICS
 from netem.tc_words import KEYWORDS
 from noack.controllers.controller_settings import ControllerSettings
+from noack.core.number_format import at_most, number
 from noack.impairments.constraints import CONSTRAINTS
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
@@ -31,7 +34,10 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES, AnyDisturbance, AnyObserver
 from noack.scenario.toml_file import json_schema
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack_check.keys import key_table
 from tests.helpers.pages import PAGES, ROOT, blocks
+from tests.helpers.shipped import resolved
 
 
 def keys_of(section: type[BaseModel], prefix: str = "") -> Iterator[str]:
@@ -224,6 +230,80 @@ def test_the_citation_agrees_with_the_package() -> None:
 
 def test_the_glossary_of_the_documentation_is_that_of_the_program() -> None:
     assert glossary() in (ROOT / "docs/glossary.md").read_text(encoding="utf-8")
+
+
+REFUSED_BY_ANOTHER_ROW = {
+    "plant.measurement.noise_std": "plant.disturbances.kind",
+    "plant.disturbances.std": "plant.disturbances.kind",
+    "network.acknowledgements.*": "network.protocol",
+}
+
+
+def test_the_table_of_the_limits_names_every_key_that_is_refused() -> None:
+    """But keys that no resolved scenario has, and those of what is refused as a whole."""
+    refused = {
+        REFUSED_BY_ANOTHER_ROW.get(key, key)
+        for key, rows in key_table().rows.items()
+        for row in rows
+        if row.use == "refused" and not row.reason.startswith("of ") and "resolved" not in row.reason
+    }
+    text = (ROOT / "docs/limits.md").read_text(encoding="utf-8").partition("| key | refused |")[2]
+    named = {key for cell in re.findall(r"^\| (`.+?) \|", text, re.MULTILINE) for key in cell.split("`")}
+    assert len(refused) >= 8
+    assert refused <= named, refused - named
+
+
+# --- bounds and sizes -----------------------------------------------------------------------------
+
+
+@cache
+def by_gains(name: str) -> ScenarioCertificate:
+    return quick_certificate(resolved(name))
+
+
+@pytest.mark.usefixtures("nothing_was_found_before")
+def test_the_bounds_by_gains_on_the_page_of_the_theory_are_proven() -> None:
+    text = (ROOT / "docs/theory.md").read_text(encoding="utf-8")
+    table = text.partition("| scenario | by gains, at t = 0 |")[2].partition("**The checker**")[0]
+    rows = re.findall(r"^\| `(\w+)`(, in the limit)? \| ([0-9.]+) \|", table, re.MULTILINE)
+    assert len(rows) == 5
+    rows += [(name, "", value) for name, value in re.findall(r"`(\w+)`\s\(([0-9.]+)\)", table)]
+    assert len(rows) == 7
+    for name, in_the_limit, value in rows:
+        proven = by_gains(name).proven
+        assert proven is not None
+        bound = proven.bounds["x"]
+        expected = by_gains(name).ultimate_state if in_the_limit else bound.decaying + bound.constant
+        assert (name, value) == (name, number(expected))
+
+
+@pytest.mark.usefixtures("nothing_was_found_before")
+def test_a_bound_in_a_comment_of_a_scenario_is_proven() -> None:
+    found = 0
+    for path in (ROOT / "scenarios").glob("*.toml"):
+        for first, rate, rest in re.findall(
+            r"#.*?([0-9.]+) e\^\(-([0-9.]+) t\) \+ ([0-9.]+[0-9])", path.read_text(encoding="utf-8")
+        ):
+            found += 1
+            proven = by_gains(path.stem).proven
+            assert proven is not None
+            bound = proven.bounds["x"]
+            assert (first, rate, rest) == (
+                at_most(bound.decaying), number(proven.rate_per_s), at_most(bound.constant),
+            )  # fmt: skip
+    assert found
+
+
+def test_the_modules_of_the_checker_are_listed_with_their_sizes() -> None:
+    text = (ROOT / "docs/theory.md").read_text(encoding="utf-8").partition("| of | modules | lines |")[2]
+    listed = set()
+    for _, cell, lines in re.findall(r"^\| (.+) \| (.+) \| ([0-9,]+) \|", text.partition("\n\n")[0], re.M):
+        modules = re.findall(r"`(\w+)`", cell)
+        paths = [ROOT / f"checker/noack_check/{module}.py" for module in modules]
+        size = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in paths)
+        assert abs(size - int(lines.replace(",", ""))) < 100, (modules, size)
+        listed |= {*modules}
+    assert listed | {"__init__"} == {path.stem for path in (ROOT / "checker/noack_check").glob("*.py")}
 
 
 # --- the site -------------------------------------------------------------------------------------

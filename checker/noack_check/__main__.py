@@ -32,7 +32,9 @@ def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser("noack-check", description="Verify the witnesses of bounds of a loop.")
     parser.add_argument(
-        "witness", type=Path, help="file that `noack certify NAME --witness FILE` has written"
+        "witness",
+        type=Path,
+        help="file that `noack certify NAME --witness FILE` or `noack margin` with --witness has written",
     )
     parser.add_argument("--scenario", type=Path, help="the scenario, by `noack check NAME --resolved`")
     arguments = parser.parse_args()

@@ -31,7 +31,7 @@ def certificate_of(
 
 
 def quick_certificate(resolved: Scenario, plants: str = "own", *, ideal: bool = False) -> ScenarioCertificate:
-    """Return a certificate with what is known already, or proven by gains, in about a second.
+    """Return a certificate with what is known already, or proven by gains, in seconds.
 
     Args:
         resolved: the scenario.

@@ -275,7 +275,7 @@ def export(
     ] = None,
     certificates: Annotated[
         bool,
-        Option(help="Certificates of each loop in a file of MATLAB; about a second for each loop."),
+        Option(help="Certificates of each loop in a file of MATLAB; seconds for each loop."),
     ] = True,
     json: opt.JsonOption = False,
 ) -> None:

@@ -72,7 +72,7 @@ def certify(
         bool,
         Option(
             help="Search for the smallest bounds that can be proven, for seconds, at most some minutes; else "
-            "those that need no search, in a second or two."
+            "those that need no search, in seconds."
         ),
     ] = True,
     verbose: Annotated[

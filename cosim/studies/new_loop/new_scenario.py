@@ -5,7 +5,7 @@ plant has friction, its model is the one beside the friction's step, and the gai
 friction to take a small share of the allowed errors; the first loop of which bounds are proven is used.
 
 Other loops are tried with several limits of consecutive losses, rates and thresholds, and also with
-slower gains if the gain is not given. Each trial is certified without a search, in about a second. The
+slower gains if the gain is not given. Each trial is certified without a search, in seconds. The
 first one whose bound of ‖x‖ is below 200 times ‖x(0)‖ is used, else the one with the smallest bound. If
 there is none, the first one is tried with a norm that counts errors by what they do to the input. x(0) is
 made smaller if a nonlinear plant does not return to 0 in a simulation.

@@ -277,7 +277,7 @@ def _conditions(
     if probability is not None:
         horizon_s = resolved.timing.horizon_ns / NS_PER_S
         known = (
-            f"with probability {at_least(probability)} or more"
+            f"with probability {at_least(probability)} or more (computed)"
             if probability > 0
             else "with a probability that may be 0"
         )

@@ -139,7 +139,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--failures", type=Path, default=Path("fuzz-failures"), help="folder for failing draws"
     )
     parser.add_argument("--runs-only", action="store_true", help="no claims, certificates and adversary")
-    parser.add_argument("--witnesses", action="store_true", help="search for witnesses of all draws, not of each fifth")
+    parser.add_argument(
+        "--witnesses", action="store_true", help="search for witnesses of all draws, not of each fifth only"
+    )
     options = parser.parse_args(arguments)
     totals, began_s = Totals(), time.monotonic()
     said_s = began_s
