@@ -4,6 +4,7 @@ import copy
 import functools
 import math
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from noack_check.proof import Proof, prove
 from noack_check.responses import Decay, responses, responses_until
 from noack_check.scenario import _squares
 from noack_check.sentences import smallest_bounds
+from noack_check.times import Schedule
 from tests.checker.random_loops import (
     random_area_loop,
     random_due_loop,
@@ -189,7 +191,7 @@ def test_changed_documents_are_rejected(change: str) -> None:
 
 def test_another_gain_is_rejected() -> None:
     loop = scalar(times=SCHEDULE)
-    with pytest.raises(RejectedError):
+    with pytest.raises(RejectedError, match=r"^gains: plant: not proven to decay so fast"):
         prove(loop._replace(gain=number(-0.6) * identity(1)), by_gains(loop)[0])
 
 
@@ -372,6 +374,13 @@ def test_a_dwell_time_has_bounds_with_tests_at_all_times() -> None:
     assert sizes(by_gains(scalar(0, floor=0.02))[1])["e_s"] < sizes(by_gains(loop)[1])["e_s"] < 0.3
 
 
+STEADY = scalar(0, SCHEDULE, floor=0.02)._replace(pushes=identity(1), sizes=(number(3.0),))
+"""All that it is pushed by is in e_c, as long as an update is on its way."""
+QUIET = scalar(0, SCHEDULE._replace(start=fmpq(0)), level=1e-3)
+"""What moves e_s beside the errors themselves shows at once."""
+NETWORK_S = fmpq(1, 50)
+UNTIL_IT_ACTS = Schedule(100.0, 1, 10.0, 0.0, 0, 0.02, input_delay_ns=Fraction(10**7)).times.delay
+"""20 ms in the network, up to 100 ms until a tick, 10 ms on the way of its input: 130 ms."""
 LIES: dict[str, tuple[Loop, Callable[[Loop], Loop]]] = {
     "a loss": (scalar(times=SCHEDULE, floor=0.02), lambda loop: loop._replace(losses=0)),
     "noise": (
@@ -411,6 +420,22 @@ LIES: dict[str, tuple[Loop, Callable[[Loop], Loop]]] = {
     ),
     "a late deadline": (
         changed(DUE, longest=fmpq(1, 4)), lambda loop: changed(loop, longest=fmpq(1, 50)),
+    ),
+    "a delay": (
+        changed(STEADY, delay=fmpq(1, 5)), lambda loop: changed(loop, delay=fmpq(0)),
+    ),
+    "a delay but that of the network": (
+        changed(STEADY, delay=UNTIL_IT_ACTS), lambda loop: changed(loop, delay=NETWORK_S),
+    ),
+    "an age": (changed(QUIET, age=fmpq(1, 5)), lambda loop: changed(loop, age=fmpq(0))),
+    "a box of A": (
+        QUIET._replace(half_A=number(0.2) * identity(1)), lambda loop: loop._replace(half_A=zeros(1, 1)),
+    ),
+    "a box of B": (
+        QUIET._replace(half_B=number(0.4) * identity(1)), lambda loop: loop._replace(half_B=zeros(1, 1)),
+    ),
+    "a mismatch of the model": (
+        QUIET._replace(model_A=number(0.8) * identity(1)), lambda loop: loop._replace(model_A=loop.A),
     ),
     "a large area": (AREA, lambda loop: loop._replace(rule=loop.rule._replace(floor=number(1e-4)))),
     "slow tests": (

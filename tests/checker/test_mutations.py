@@ -17,8 +17,8 @@ from noack.theory.witnesses.documents import find_witness
 from noack_check.balls import beside, matrix, number, zeros
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
-from noack_check.model import Model
-from noack_check.proof import prove, read_assumptions
+from noack_check.proof import prove
+from tests.checker.completed import completed
 from tests.checker.floating_forms import Forms
 from tests.checker.runs import exceeded
 from tests.checker.test_observers import LOOP as OBSERVED
@@ -72,13 +72,7 @@ def with_errors(loop: Loop, document: Document) -> Document:
     proof = prove(loop, document)
     sensor = [bound for bound in proof.bounds if bound.output == "e_s"][-1]
     errors = {"decaying": float(sensor.decaying.mid()) * 1.001, "constant": 0.0}
-    found = {**copy.deepcopy(document), "errors": errors}
-    assumed = read_assumptions(loop, number(found["rate"]), found)
-    for entry in found["bounds"]:
-        model = Model(loop, number(found["rate"]), number(entry["decay"]), assumed.errors)
-        for item in model.inequalities(entry["output"], starts=True):
-            for name, _ in item.scalars:
-                entry["numbers"].setdefault(name, 0.0)
+    found = completed(loop, {**document, "errors": errors})
     prove(loop, found)
     return found
 

@@ -22,6 +22,7 @@ from noack_check.proof import (
     weighted,
 )
 from noack_check.scenario import read_loop
+from tests.checker.completed import completed
 from tests.checker.runs import exceeded, floats
 from tests.checker.test_false_witnesses import early, failing, rejects
 from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
@@ -119,14 +120,15 @@ def test_all_tests_fail_with_more_noise(witness: Witness) -> None:
 
 def test_a_document_without_noise_proves_nothing_with_noise() -> None:
     loop = double_integrator(floor=0.03)
-    rejects(noisy(loop), find_witness(loop).document)
+    document = completed(noisy(loop), find_witness(loop).document)
+    rejects(noisy(loop), document, "^x: edge/0 lost, sent/")
 
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_noise_of_one_state_needs_its_multiplier(witness: Witness, index: int) -> None:
     one = LOOP._replace(noise=matrix([[SIZE * (index == 0)], [SIZE * (index == 1)]]))
     document = find_witness(one).document
-    rejects(LOOP, document, "missing")
+    rejects(LOOP, completed(LOOP, document), "^x: edge/0 lost, sent/")
     prove(one, document)
 
 
@@ -161,16 +163,16 @@ def test_the_time_between_events_is_shorter_by_the_noise_of_two_measurements(wit
     assert isinstance(rate, float)
     without = inter_event_s(LOOP._replace(noise=zeros(2, 0)), rate, drift)
     assert without > 1.2 * witness.document["inter_event_s"]  # type: ignore[operator]
-    rejects(LOOP, {**witness.document, "inter_event_s": without}, "inter_event_s")
+    rejects(LOOP, {**witness.document, "inter_event_s": without}, "^inter_event_s: an event may")
     once = inter_event_s(noisy(LOOP, SIZE / 2), rate, drift)
-    rejects(LOOP, {**witness.document, "inter_event_s": once}, "inter_event_s")
+    rejects(LOOP, {**witness.document, "inter_event_s": once}, "^inter_event_s: an event may")
 
 
 def test_without_a_floor_noise_makes_events_at_once() -> None:
     loop = noisy(double_integrator(level=0.05))
     assert inter_event_s(loop, 0.3, (0.1, 0.0)) == 0
-    found = find_witness(double_integrator(level=0.05)).document
-    rejects(loop, found)
+    found = completed(loop, find_witness(double_integrator(level=0.05)).document)
+    rejects(loop, found, "^x: edge/0 lost, sent/")
 
 
 def test_the_first_event_may_come_earlier_by_noise() -> None:
@@ -181,7 +183,7 @@ def test_the_first_event_may_come_earlier_by_noise() -> None:
     assert isinstance(apart, float)
     without = first_event_s(loop, drift_of(found.proof), 2 * apart)
     assert without > found.document["first_event_s"]  # type: ignore[operator]
-    rejects(noisy(loop), {**found.document, "first_event_s": without}, "first_event_s")
+    rejects(noisy(loop), {**found.document, "first_event_s": without}, "^first_event_s: an event may")
 
 
 def test_a_start_is_quiet_up_to_the_noise_of_two_measurements() -> None:
@@ -216,7 +218,8 @@ def test_errors_are_assumed_with_the_noise(witness: Witness) -> None:
     sizes = {name: float(getattr(sensor, name).mid()) for name in ("decaying", "constant")}
     most = max(1.0, sizes["decaying"] / sizes["constant"])
     with_noise = {name: size * 3 + most * SIZE * 2**0.5 for name, size in sizes.items()}
-    rejects(LOOP, {**witness.document, "errors": sizes}, "errors|missing")
+    document = completed(LOOP, {**witness.document, "errors": sizes})
+    rejects(LOOP, document, "^errors: the sensor's error may exceed them")
     decaying, constant = drift_of(witness.proof)
     drift = Bound("drift", number(decaying), number(constant), True)
     assumed = Errors(number(with_noise["decaying"]), number(with_noise["constant"]), Chain(arb(1), arb(1)))

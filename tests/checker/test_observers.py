@@ -20,6 +20,7 @@ from noack_check.model import Model
 from noack_check.noise import noise_of
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
+from tests.checker.completed import completed
 from tests.checker.runs import exceeded, floats
 from tests.checker.test_false_witnesses import rejects
 from tests.checker.test_witnesses import double_integrator
@@ -232,7 +233,7 @@ def test_bounds_are_not_exceeded(witness: Witness) -> None:
 def test_runs_from_another_estimate_exceed_the_bounds(witness: Witness) -> None:
     assert LOOP.observer is not None
     far = LOOP._replace(observer=LOOP.observer._replace(start=matrix([[-20.0], [10.0]])))
-    rejects(far, witness.document)
+    rejects(far, completed(far, witness.document), "^x: edge/0 lost, sent/")
     assert any(exceeded(far, witness.proof, np.random.default_rng(seed), 4.0) for seed in range(3))
 
 
@@ -259,31 +260,44 @@ def test_a_loop_that_is_none_is_rejected(witness: Witness, change: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"columns": 1}, {"columns": [[1], [0]]}, {"rates": [[1]]}, {"rates": [["a", 0], [0, 1]]},
-                {"start": [[0.1]]}, {"start": [0.1, 0.2]}, {"start": [[0.1], [0.2, 0.3]]}]
-)  # fmt: skip
-def test_a_smooth_part_has_matrices_that_fit(witness: Witness, changes: dict[str, object]) -> None:
+    ("changes", "reason"),
+    [
+        ({"columns": 1}, "^columns: not a matrix"),
+        ({"columns": [[1], [0]]}, "^observer: columns, rates and start do not fit"),
+        ({"rates": [[1]]}, "^observer: columns, rates and start do not fit"),
+        ({"rates": [["a", 0], [0, 1]]}, "^rates: not a number"),
+        ({"start": [[0.1]]}, "^observer: columns, rates and start do not fit"),
+        ({"start": [0.1, 0.2]}, "^start: not a matrix"),
+        ({"start": [[0.1], [0.2, 0.3]]}, "^start: rows of different lengths"),
+    ],
+)
+def test_a_smooth_part_has_matrices_that_fit(
+    witness: Witness, changes: dict[str, object], reason: str
+) -> None:
     document: dict[str, Any] = copy.deepcopy(dict(witness.document))
     document["observer"] |= changes
-    rejects(LOOP, document, "observer|columns|rates|start")
+    rejects(LOOP, document, reason)
 
 
-@pytest.mark.parametrize("value", [1, [], {}])
-def test_a_smooth_part_is_a_table(witness: Witness, value: object) -> None:
-    rejects(LOOP, {**witness.document, "observer": value}, "observer|columns")
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [(1, "^observer: not a table"), ([], "^observer: not a table"), ({}, "^columns: not a matrix")],
+)
+def test_a_smooth_part_is_a_table(witness: Witness, value: object, reason: str) -> None:
+    rejects(LOOP, {**witness.document, "observer": value}, reason)
 
 
 def test_a_document_without_the_smooth_part_proves_nothing(witness: Witness) -> None:
     document: dict[str, Any] = copy.deepcopy(dict(witness.document))
     prove(LOOP, document)
     del document["observer"]
-    rejects(LOOP, document)
+    rejects(LOOP, document, r"^x: X is not a symmetric \(2, 2\)")
 
 
 def test_another_smooth_part_is_no_proof_by_the_same_forms(witness: Witness) -> None:
     document: dict[str, Any] = copy.deepcopy(dict(witness.document))
     document["observer"]["rates"] = (np.array(document["observer"]["rates"]) * 1.5).tolist()
-    rejects(LOOP, document)
+    rejects(LOOP, document, "^x: flow/0 lost/")
 
 
 # The scenario.
