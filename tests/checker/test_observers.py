@@ -323,7 +323,7 @@ def test_an_observer_is_read() -> None:
 REFUSED = {
     "plant.B=[[0.0], [0.9]]": r"plant\.B",
     "network.initial_sync=known_state": "known_state",
-    "plant.rate_hz=300": "observer: not covered",
+    "plant.rate_hz=300": "with an observer the periods are whole ns",
 }
 
 
@@ -339,7 +339,7 @@ def test_a_box_and_ideal_conditions_are_refused() -> None:
     tables = resolved_tables("double_integrator", *SCENARIO, "plant.uncertainty_B=[[0.0], [0.2]]")
     with pytest.raises(RefusedError, match=r"plant\.B"):
         read_loop(tables, box=True, ideal=False)
-    with pytest.raises(RefusedError, match="observer: not covered"):
+    with pytest.raises(RefusedError, match="observer: ideal conditions, with tests at all times"):
         read_loop(tables, box=False, ideal=True)
 
 
