@@ -19,6 +19,7 @@ from noack.scenario.resolution import loop_of, resolve
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from tests.helpers.approved import compare_lines
 from tests.helpers.command_line import invoke
+from tests.helpers.pages import blocks
 
 POLE = '''
 import math
@@ -205,46 +206,35 @@ def test_one_command_leads_from_a_class_to_a_guarantee_in_its_own_units() -> Non
     assert noack.load("smaller").trigger.floor < scenario.trigger.floor / 5
 
 
-TABLE = """
-import math
-import numpy as np
-
-class Table:
-    states = ["angle, rad", "speed, rad/s"]
-    inputs = ["torque, N m"]
-    allowed = {"angle": 0.03}
-    initial_state = [0.6, 0.0]
-
-    def derivative(self, t_s, z, u):
-        friction = 0.05 * z[1] + 0.01 * FRICTION
-        return z[1], (u[0] - friction) / 0.02
-"""
-
-
 def test_dry_friction_is_left_out_of_the_model_and_kept_in_the_guarantee() -> None:
-    """Its tanh is steep for the speeds of the loop; the class may use math."""
-    Path("table.py").write_text(TABLE.replace("FRICTION", "math.tanh(z[1] / 0.05)"))
-    made = noack.new("table.py", "table.toml")
-    assert made.gain.model.A[1, 1] == pytest.approx(-2.5, rel=1e-3)  # of the viscous friction
+    """Its tanh is steep for the speeds of the loop; the class of the readme uses math."""
+    (code,) = blocks("README.md", "python")
+    Path("servo.py").write_text(code)
+    made = noack.new("servo.py", "servo.toml")
+    assert made.gain.model.A[1, 1] == pytest.approx(-4.0, rel=1e-3)  # of the viscous friction
     promised = re.fullmatch(
-        r"angle stays within 0.03 rad of its set-point from ([\d.]+) s on, although up to 4 consecutive "
+        r"angle stays within 0.02 rad of its set-point from ([\d.]+) s on, although up to 4 consecutive "
         r"packets are lost \(proved\)",
         made.guarantee,
     )
     assert promised is not None, made.guarantee
-    made.save("table.toml")
+    made.save("servo.toml")
     for seed in range(2):
-        run = noack.simulate(noack.load("table", {"seeds.loss": seed, "certificate.prove": False}))
+        run = noack.simulate(noack.load("servo", {"seeds.loss": seed, "certificate.prove": False}))
         rows = run.table("plant_step").to_pydict()
         assert rows["angle"] == rows["x_1"]
         late = np.array(rows["t_s"]) >= float(promised[1])
-        assert np.abs(np.array(rows["angle"])[late]).max() <= 0.03
+        assert np.abs(np.array(rows["angle"])[late]).max() <= 0.02
 
 
 def test_friction_that_jumps_is_refused_with_what_to_write_instead() -> None:
-    Path("table.py").write_text(TABLE.replace("FRICTION", "np.sign(z[1])"))
-    with pytest.raises(CallerError, match=r"table.py: .* cannot be integrated at .* write np.tanh\(v / w\)"):
-        noack.new("table.py", "table.toml")
+    (code,) = blocks("README.md", "python")
+    code = code.replace("import math", "import numpy as np").replace(
+        "math.tanh(rate / 0.05)", "np.sign(rate)"
+    )
+    Path("servo.py").write_text(code)
+    with pytest.raises(CallerError, match=r"servo.py: .* cannot be integrated at .* write np.tanh\(v / w\)"):
+        noack.new("servo.py", "servo.toml")
 
 
 @pytest.mark.parametrize("name", ["cart_pole", "four_tank", "quadrotor"])
