@@ -62,6 +62,7 @@ is enclosed on a region, this holds up to the time at which x or u would leave i
 they do not: see :mod:`.proof`.
 """
 
+import math
 from collections.abc import Container, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
@@ -78,8 +79,8 @@ from noack_check.responses import Decay, Response, norm_of, responses, responses
 
 Form = Mapping[str, arb]
 """Σ coefficient · signal, by the signals' names; "1" is the constant 1."""
-_NO_BOUND = "gains: what losses and delays add to the errors may feed on itself, without a bound"
-"""The spectral radius of F is not proven to be below 1."""
+_STEPS_OF_GAIN = 200
+"""Products with F after which its spectral radius is read, for a message."""
 _ROOM = 1e-9
 """By so much, relatively, y exceeds the solution of y = Fy + g."""
 _MOST_TESTS = 1_000_000
@@ -516,7 +517,7 @@ class UnitGains:
                 break
             y, slope = smaller, following
         if not self._compared(y["share"]) < y["compared"]:
-            raise RejectedError(_NO_BOUND)
+            raise _unbounded(dict(self._inequalities(slope)))
         return y
 
     def _solution_at(self, slope: arb) -> dict[str, arb]:
@@ -529,7 +530,7 @@ class UnitGains:
             if not failing:
                 return y
             chosen |= dict(failing)
-        raise RejectedError(_NO_BOUND)
+        raise _unbounded(chosen)
 
 
 def _sum(*terms: tuple[arb, Form]) -> Form:
@@ -561,11 +562,28 @@ def _solved(rows: Mapping[str, Form]) -> dict[str, arb]:
             arb_mat(len(names), 1, [((1 + _ROOM) * each + room).mid() for each in right])
         )
     except ZeroDivisionError:
-        raise RejectedError(_NO_BOUND) from None
+        raise _unbounded(rows) from None
     found = {name: arb(y[i, 0].mid()) for i, name in enumerate(names)}
     if not all(size > 0 for size in found.values()):
-        raise RejectedError(_NO_BOUND)
+        raise _unbounded(rows)
     return found | {"1": arb(1)}
+
+
+def _unbounded(rows: Mapping[str, Form]) -> RejectedError:
+    """Return that y > Fy + g is not solved, with the spectral radius of F, about, which has to be below 1."""
+    y, radius = dict.fromkeys(rows, 1.0), 0.0
+    for _ in range(_STEPS_OF_GAIN):
+        following = {
+            name: sum(float(size) * y[other] for other, size in form.items() if other in y)
+            for name, form in rows.items()
+        }
+        radius = max(map(abs, following.values()))
+        if not 0 < radius < math.inf:
+            break
+        y = {name: value / radius for name, value in following.items()}
+    return RejectedError(
+        f"gains: what losses and delays add to the errors returns {radius:.4g} times as large, not below 1"
+    )
 
 
 class Gains:

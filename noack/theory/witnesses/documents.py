@@ -94,10 +94,11 @@ def find_witness(
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # of huge states; the checker decides
             return _by_forms(loop, wanted, Effort(progress, most_work))
-    except NoWitnessError as error:
-        with contextlib.suppress(NoWitnessError):
+    except NoWitnessError as of_forms:
+        try:
             return witness_by_gains(loop, wanted.by_gains)
-        raise error
+        except NoWitnessError as of_gains:
+            raise type(of_forms)(f"{of_forms}; {of_gains}") from None
 
 
 def witness_by_gains(loop: Loop, outputs: Sequence[str]) -> Witness:
@@ -130,7 +131,7 @@ def _by_forms(loop: Loop, wanted: "_Wanted", effort: Effort) -> Witness:
             except NoWitnessError as error:
                 reason = error
         with contextlib.suppress(NoWitnessError):
-            return _by_clock(loop, wanted, effort)
+            return _by_clock(loop, wanted, effort, _PIECES_OF_TESTS[:-1])  # the last ones take minutes
         raise reason
     try:
         return _by_threshold(loop, rates, wanted, effort)
@@ -226,11 +227,12 @@ def _by_quadratic_forms(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Ef
     return search.witness(document, [*search.bounds(wanted), sensor], wanted)
 
 
-def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort) -> Witness:
+def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort, tried: Sequence[int] = ()) -> Witness:
     """Return a witness by forms at nodes of clocks, with the fewest pieces for which there is one.
 
     The clocks count from events of a periodic rule, or from tests that are an exact time apart. Without
     forms for a small ν there are none for larger ones, and no bound decays faster than one of a similar loop.
+    ``tried``: numbers of pieces, if not all that are worth it.
     """
     by_tests = not loop.times.period > 0
     if loop.rule.memory is not None and loop.losses:
@@ -238,7 +240,7 @@ def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort) -> Witness:
     if loop.rule.memory is not None and loop.holds:  # x_s rests, and where xᵀPB = 0 K e_s may have any size
         raise NoWitnessError("trigger.policy: a dynamic rule bounds no held input; one with a deadline does")
     fastest = min((each["rate"] for each in wanted.near if isinstance(each["rate"], float)), default=math.inf)
-    for pieces in _PIECES_OF_TESTS if by_tests else _PIECES:
+    for pieces in tried or (_PIECES_OF_TESTS if by_tests else _PIECES):
         for rates in (_Rates(loop, slow=share, by_tests=by_tests) for share in (0.3, 0.02)):
             if rates.rate > fastest:
                 continue

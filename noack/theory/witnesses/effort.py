@@ -4,8 +4,9 @@ from noack.core.progress import Progress
 
 MOST_WORK = 20.0
 """A search ends after so many 10⁹ products per step of the solver: some minutes."""
-_MOST_PER_PROBLEM = 8.0
-"""A larger problem takes minutes, and seldom ends well: those of the F-16 under its schedule are 12 to 14."""
+_MOST_PER_PROBLEM = 2.0
+"""A larger problem takes minutes, and seldom ends well: those of the F-16 under its schedule are 12 to 14.
+The largest of the other shipped scenarios is 0.5."""
 _LAST_SHARE = 0.99
 
 
@@ -40,7 +41,10 @@ class Effort:
             WorkLimitError: it is one too many, or too large.
         """
         if work > _MOST_PER_PROBLEM:
-            raise WorkLimitError(f"{output}: its inequalities are too large for the search")
+            raise WorkLimitError(
+                f"{output}: its inequalities are too large for the search ({work:.2g} · 10⁹ products a step, "
+                f"{_MOST_PER_PROBLEM:g} at most)"
+            )
         if self._work + work > self._most_work:
             raise WorkLimitError(
                 f"{output}: the search ended after {self._problems} problems, at its limit of work"
