@@ -293,11 +293,12 @@ def test_the_bounds_by_gains_on_the_page_of_the_theory_are_proven() -> None:
 @pytest.mark.system  # a minute of CPU time
 @pytest.mark.usefixtures("nothing_was_found_before")
 def test_the_bounds_after_a_search_on_the_page_of_the_theory_are_found() -> None:
+    """To 1 %: the command searches other statements first, and begins with what it found for them."""
     for name, in_the_limit, _, value in bounds_of_theory()[0]:
         scenario = resolved(name)
         statement = find_statement(scenario, "own", "schedule")
         found = certificate_of(scenario, statement, allowed_conditions(scenario))
-        assert (name, value) == (name, bound_on_page(found, in_the_limit))
+        assert float(value) == pytest.approx(float(bound_on_page(found, in_the_limit)), rel=0.01), name
 
 
 @pytest.mark.usefixtures("nothing_was_found_before")
