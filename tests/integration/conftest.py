@@ -1,12 +1,38 @@
-"""Live runs and processes, started in the background, as fixtures."""
+"""Live runs and processes, started in the background, as fixtures; each complete run is explained."""
 
+import json
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from cosim.record.run_record import load_run
 from tests.helpers.live_runs import Running, start_commands, start_runs
+from tests.oracles.explained_run.explain import explains
+from tests.oracles.explained_run.findings import SCHEDULE
+
+EXPLAINED = set[Path]()
+"""The runs of this session that were compared with the model."""
+
+
+@pytest.fixture(autouse=True)
+def complete_runs_are_those_of_the_model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Compare each complete record that a test, or its module, leaves with the model of its scenario.
+
+    A late machine exceeds the times of the schedule in a live run: these are not compared.
+    """
+    yield
+    for path in sorted({*tmp_path_factory.getbasetemp().rglob("summary.json")} - EXPLAINED):
+        EXPLAINED.add(path)
+        loops = json.loads(path.read_text())["loops"]
+        if not all(loop["replay"] and loop["replay"]["complete"] for loop in loops):
+            continue
+        for record in load_run(path.parent).loops:
+            findings = explains(record)
+            if record.kind == "live":
+                findings = [finding for finding in findings if finding.part != SCHEDULE]
+            assert not findings, "\n".join([str(path.parent), *map(str, findings[:5])])
 
 
 @pytest.fixture
