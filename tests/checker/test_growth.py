@@ -194,6 +194,71 @@ def test_what_is_accepted_of_changed_witnesses_is_true(seed: int) -> None:
     assert 4 < rejected < 24
 
 
+UNSTABLE = ("lane_periodic", "mode=zoh", delayed(0.01))
+
+
+def growth_of(loop: PeriodicLoop, pattern: str) -> float:
+    """Return the growth per period of a pattern that is repeated, from any slot the least, in floats."""
+    maps, slots = dict(zip("DL", matrices(loop), strict=True)), loop.times.slots
+    periods, found = lcm(len(pattern), slots), []
+    for first in range(slots):
+        Π = np.eye(len(maps["D"][0]))
+        for k in range(periods):
+            Π = maps[pattern[k % len(pattern)]][(first + k) % slots] @ Π
+        found.append(float(np.abs(np.linalg.eigvals(Π)).max() ** (1 / periods)))
+    return min(found)
+
+
+def changed_pattern(document: Mapping[str, object], rng: np.random.Generator) -> dict[str, object]:
+    """Return a witness of a growing pattern with one change."""
+    changed = copy.deepcopy(dict(document))
+    table = changed["unstable"]
+    kind, pattern = rng.integers(0, 7), list(table["pattern"])
+    if kind == 0:
+        k = rng.integers(len(pattern))
+        pattern[k] = "L" if pattern[k] == "D" else "D"
+    elif kind == 1:
+        pattern.insert(rng.integers(len(pattern) + 1), rng.choice(["D", "L"]))
+    elif kind == 2:
+        del pattern[rng.integers(len(pattern))]
+    elif kind == 3:
+        table["squarings"] = int(rng.choice([-1, 0, 1, 3, 10, 39, 41, 10**6]))
+    elif kind == 4:
+        changed["losses"] += int(rng.choice([-2, -1, 1]))
+    elif kind == 5:
+        row = table["coordinates"][rng.integers(len(table["coordinates"]))]
+        row[rng.integers(len(row))] *= float(rng.choice([-1.0, 0.0, 0.9, 1.1, 30.0]))
+    else:
+        table["intervals"] = [int(rng.choice([1, 1, 1, 2])) for _ in pattern]
+    table["pattern"] = "".join(pattern)
+    return changed
+
+
+def test_what_is_accepted_of_changed_patterns_grows() -> None:
+    rng = np.random.default_rng(4)
+    content = resolved_content(scenario(*UNSTABLE))
+    loop = read_periodic_loop(content)
+    document, bound = accepted(loop)
+    assert bound > 1.5
+    document["unstable"].setdefault("coordinates", np.eye(loop.size).tolist())  # type: ignore[attr-defined]
+    found = []
+    for number in range(210):
+        is_scenario = number % 5 == 0
+        other_loop = read_periodic_loop(changed_scenario(content, rng)) if is_scenario else loop
+        other = document if is_scenario else changed_pattern(document, rng)
+        try:
+            what = prove_growth(other_loop, other)
+        except RejectedError:
+            continue
+        assert what.lower is not None
+        checked = other_loop.under(other_loop.guarantee._replace(losses=what.losses))
+        assert allows(checked, what.pattern * 3)
+        assert float(what.lower) <= growth_of(checked, what.pattern) * (1 + 1e-9)
+        found.append(float(what.lower))
+    assert 40 < len(found) < 160
+    assert min(found) < 1 < max(found)
+
+
 def stable() -> tuple[PeriodicLoop, dict[str, object]]:
     loop = periodic(*SMALL)
     return loop, accepted(loop)[0]
