@@ -124,7 +124,10 @@ def _check_ages(run: ExplainedLoop, conditions: NetworkConditions, steps: Rows) 
     sent_ns = dict(zip(received["sequence"].tolist(), received["t_ns"].tolist(), strict=True))
     for row in steps:
         has_entry = "entry" in (row.dtype.names or ())
-        ahead_ns = math.floor(max(int(row["entry"]), 0) * timing.controller_period.exact) if has_entry else 0
+        entry = int(row["entry"]) if has_entry else 0
+        if entry < 0:  # the watchdog holds the last one
+            entry = run.scenario.controller.predictions - 1
+        ahead_ns = math.floor(entry * timing.controller_period.exact)
         input_ns = sent_ns.get(int(row["actuation"]), 0) + ahead_ns
         t_ns = int(row["t_ns"])
         age_ns = t_ns + timing.plant_period_ns - input_ns
