@@ -324,10 +324,10 @@ class _Responses:
         """Return the growth of W e_s within a time, from W⁻¹ and by each source."""
         return responses_until(self.scaled_H, until, [self.loop.weight], self.columns)[0]
 
-    def ever_after(self, apart: arb) -> list[dict[str, list[Response]]]:
-        """Return :attr:`ever` from 0, 1, … times a time on, one for each lost event."""
+    def ever_after(self, apart: arb) -> list[tuple[dict[str, list[Response]], int]]:
+        """Return :attr:`ever` from 0, 1, … times a time on, each with the number of lost events."""
         if is_zero(self.scaled_H) or not 1 < self.lost <= _MOST_AGES:
-            return [self.ever] * self.lost
+            return [(self.ever, self.lost)] if self.lost else []
         key = str(apart.fmpq())
         if self._ever_after[0] != key:
             aged = [(k * apart * self.scaled_H).exp() * Y for k in range(self.lost) for Y in self.columns]
@@ -342,7 +342,7 @@ class _Responses:
                     for k in range(self.lost)
                 ],
             )
-        return self._ever_after[1]
+        return [(each, 1) for each in self._ever_after[1]]
 
     def _for_ever(self, outputs: Sequence[arb_mat]) -> list[list[Response]]:
         if is_zero(self.scaled_H):
@@ -433,7 +433,7 @@ class UnitGains:
 
     def lost(self, name: str, apart: arb) -> Form:
         """Return the bound of what lost events add to an output |C e_c|, if two are at least so far apart."""
-        every = [self._lost(ever[name], 1) for ever in self.responses.ever_after(apart)]
+        every = [self._lost(ever[name], events) for ever, events in self.responses.ever_after(apart)]
         return _sum(*(term for terms, sources in every for term in (*terms, *self.driven(sources))))
 
     def _lost(self, ever: Sequence[Response], lost: int) -> tuple[list[tuple[arb, Form]], list[Response]]:

@@ -13,7 +13,7 @@ from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.analysis.tried_settings import MOST_S, TriedSettings
 from cosim.output.document import Block, Document, Sentence, SentenceRole
-from cosim.output.guarantee_sentence import guarantee_sentence
+from cosim.output.guarantee_sentence import although_lost, guarantee_sentence
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
 from cosim.simulation.sampled_loop import SampledLoop
@@ -97,6 +97,9 @@ def _few_lines(results: Certificates) -> Iterator[Sentence]:
             yield _prose(_apart_in_words(certificate, apart_s))
         assumed = [each.what for each in certificate.assumptions if each.verdict is AssumptionStatus.ASSUMED]
         yield _prose(f"assumed, and checked in each run: {'; '.join(assumed)}")
+    elif (paper := results.paper) is not None and paper.has("x"):
+        formula = paper.formula(state_norm(results), "x")
+        yield _prose(f"proved only under the paper's conditions, without sampling, delay and hold: {formula}")
     if (outside := outside_box(results.scenario)) is not None:
         yield _doubt("the stated uncertainty does not contain this plant:", outside)
     yield from map(_prose, _stability_in_words(results))
@@ -115,6 +118,9 @@ def _first_sentence(results: Certificates) -> Sentence:
     if text is not None:
         return Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.GOOD, is_prose=True)
     why = results.answer.text.removeprefix("no certificate").lstrip(": ")
+    if results.is_proven_stable:
+        text = f"stable if nothing is late{although_lost(results.scenario)} (proved); no bound: {why}"
+        return Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.DOUBTFUL, is_prose=True)
     text = f"no guarantee{f': {why}' if why else ''}"
     return Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.DOUBTFUL, is_prose=True)
 
@@ -135,7 +141,7 @@ def _doubt(lead: str, text: str) -> Sentence:
 
 def _advice(results: Certificates) -> Sentence:
     """Return that there is no certificate, and settings with which there is one."""
-    parts = ["so no bound of ‖x‖"]
+    parts = ["so no bound of ‖x‖" + (" but that it does not grow" if results.is_proven_stable else "")]
     if not results.is_searched:
         parts.append("a search, noack certify without --no-search, may find one")
     if settings := _listed("there is one", results.helpful_settings):

@@ -202,6 +202,11 @@ def test_a_loop_gain_above_1_is_rejected() -> None:
         prove(changed(loop, age=fmpq(1)), by_gains(loop)[0])
 
 
+def test_more_losses_than_a_loop_may_have_are_refused_at_once() -> None:
+    with pytest.raises(NoWitnessError, match="0 to 1000 losses"):
+        witness_by_gains(double_integrator()._replace(losses=10**6), ["x"])
+
+
 def test_what_is_not_covered_is_rejected() -> None:
     loop = double_integrator()
     document = by_gains(loop)[0]

@@ -15,6 +15,8 @@ from noack.runtime.console import SafeConsole
 
 _LINE_EVERY_S = 10.0
 """Time between two lines about some work, if there is no terminal."""
+_shown: list[Event] = []
+"""Of the work whose lines are printed, the innermost one last."""
 _LEAST_SHARE = 0.1
 """Of the work, from which on the remaining time is estimated: the first tries may take longer."""
 
@@ -60,18 +62,23 @@ class _SparseLines:
 
 @contextmanager
 def _line_at_intervals(line: Callable[[], str], *, printed: bool) -> Iterator[None]:
-    """Print a line every ``_LINE_EVERY_S`` while the context lasts, whatever it does."""
+    """Print a line every ``_LINE_EVERY_S`` while the context lasts, but while there is one within it."""
     has_ended = Event()
 
     def print_lines() -> None:
         while not has_ended.wait(_LINE_EVERY_S):
-            print_to_stderr(f"noack: {line()}")
+            if _shown[-1:] == [has_ended]:
+                print_to_stderr(f"noack: {line()}")
 
-    if printed:
-        Thread(target=print_lines, daemon=True).start()
+    if not printed:
+        yield
+        return
+    _shown.append(has_ended)
+    Thread(target=print_lines, daemon=True).start()
     try:
         yield
     finally:
+        _shown.remove(has_ended)
         has_ended.set()
 
 

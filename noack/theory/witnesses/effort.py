@@ -43,7 +43,7 @@ class Effort:
         if work > _MOST_PER_PROBLEM:
             raise WorkLimitError(
                 f"{output}: its inequalities are too large for the search ({work:.2g} · 10⁹ products a step, "
-                f"{_MOST_PER_PROBLEM:g} at most)"
+                f"at most {_MOST_PER_PROBLEM:g} · 10⁹)"
             )
         if self._work + work > self._most_work:
             raise WorkLimitError(

@@ -101,6 +101,8 @@ def find_by_gains(loop: Loop, outputs: Sequence[str]) -> dict[str, object]:
     Raises:
         NoWitnessError: nothing is proven by gains.
     """
+    if fault := loop.fault():
+        raise NoWitnessError(fault)
     if loop.loads:
         raise NoWitnessError("model.load: gains do not cover loads, a search may")
 
