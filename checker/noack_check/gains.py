@@ -581,6 +581,8 @@ def _unbounded(rows: Mapping[str, Form]) -> RejectedError:
         if not 0 < radius < math.inf:
             break
         y = {name: value / radius for name, value in following.items()}
+    if not 1 <= radius < math.inf:
+        return RejectedError("gains: the inequalities between the suprema are not solved")
     return RejectedError(
         f"gains: what losses and delays add to the errors returns {radius:.4g} times as large, not below 1"
     )

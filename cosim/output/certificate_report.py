@@ -118,7 +118,7 @@ def _first_sentence(results: Certificates) -> Sentence:
     if text is not None:
         return Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.GOOD, is_prose=True)
     why = results.answer.text.removeprefix("no certificate").lstrip(": ")
-    if results.is_proven_stable:
+    if _is_stable(results):
         text = f"stable if nothing is late{although_lost(results.scenario)} (proved); no bound: {why}"
         return Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.DOUBTFUL, is_prose=True)
     text = f"no guarantee{f': {why}' if why else ''}"
@@ -141,7 +141,7 @@ def _doubt(lead: str, text: str) -> Sentence:
 
 def _advice(results: Certificates) -> Sentence:
     """Return that there is no certificate, and settings with which there is one."""
-    parts = ["so no bound of ‖x‖" + (" but that it does not grow" if results.is_proven_stable else "")]
+    parts = [f"so no bound of ‖x‖{', though the loop is stable' if _is_stable(results) else ''}"]
     if not results.is_searched:
         parts.append("a search, noack certify without --no-search, may find one")
     if settings := _listed("there is one", results.helpful_settings):
@@ -149,6 +149,11 @@ def _advice(results: Certificates) -> Sentence:
     if _is_searched_for_losses(results.scenario):
         parts.append("noack adversary shows what losses can do to it")
     return _doubt("no certificate for the schedule,", "; ".join(parts))
+
+
+def _is_stable(results: Certificates) -> bool:
+    """Return whether no loss pattern makes a time-triggered loop grow in the long run, as proven."""
+    return results.stability is not None and results.stability.verdict == "stable"
 
 
 def _is_searched_for_losses(resolved: Scenario) -> bool:

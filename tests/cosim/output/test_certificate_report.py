@@ -282,6 +282,17 @@ def test_what_is_proven_leaves_nothing_undecided() -> None:
     assert "Not decided whether" not in printed(with_proofs(results, ("own", "schedule", PROVEN)))
 
 
+def test_only_a_proven_growth_below_1_is_called_stable() -> None:
+    """A certificate that bounds no ‖x‖ says nothing about stability."""
+    results = Certificates(resolved("lane_periodic"))
+    errors = PROVEN._replace(bounds={"e_s": PROVEN.bounds["x"]})
+    for upper, proven, is_stable in ((0.95, None, True), (1.1, None, False), (1.1, errors, False)):
+        results.__dict__["stability"] = Stability(0.9, upper, (True,), (0.05,))
+        text = printed(with_proofs(results, ("own", "schedule", proven)), verbose=False)
+        assert ("stable if nothing is late" in text) is is_stable
+        assert ("though the loop is stable" in " ".join(text.split())) is is_stable
+
+
 def test_the_table_has_the_bounds_of_what_is_proven() -> None:
     outputs = 'outputs=[{name="angle", unit="rad"}, {name="rate", unit="rad/s"}]'
     results = with_proofs(

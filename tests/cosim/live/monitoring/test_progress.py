@@ -42,3 +42,17 @@ def test_the_remaining_time_follows_from_the_share(
             time.sleep(0.01)
             printed += capsys.readouterr().err
     assert re.search(r"noack: proving: 25 % after \d+ s, about \d+ s left", printed)
+
+
+def test_work_within_other_work_prints_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "_LINE_EVERY_S", 0.01)
+    printed, ends_s = "", time.monotonic() + MOST_S
+    with progress.activity("outer"), progress.work_bar("inner", lines=True):
+        capsys.readouterr()
+        while printed.count("\n") < 3 and time.monotonic() < ends_s:
+            time.sleep(0.01)
+            printed += capsys.readouterr().err
+    assert "inner" in printed
+    assert printed.count("outer") <= 1  # begun before
