@@ -21,12 +21,12 @@ from noack_check.proof import Proof, prove
 from tests.checker.runs import exceeded
 from tests.checker.test_gains import AREA, DUE, scalar, with_form
 from tests.checker.test_mutations import LOOPS
-from tests.checker.test_witnesses import SCHEDULE
+from tests.checker.test_witnesses import IDEAL, SCHEDULE
 
 Document = dict[str, Any]
 Rng = np.random.Generator
 _OUTPUTS = ("x", "e_s", "e_c", "u[0]")
-_SECONDS = 3.0
+_SECONDS, _LESS = 3.0, 0.9
 
 
 def estimated(*gains: arb_mat) -> Loop:
@@ -42,6 +42,7 @@ BASES: dict[str, Loop] = {
     "a form": with_form(scalar(1, SCHEDULE), [[-0.01, 0.02], [0.02, 1.0]]),
     "a threshold": scalar(times=SCHEDULE),
     "an integral": AREA,
+    "an integral at all times": AREA._replace(times=IDEAL),
     "a deadline": DUE,
     "an observer": estimated(number(0.3) * identity(1)),
     "a filter": estimated(*((number(g) + arb(0, 1e-6)) * identity(1) for g in (0.9, 0.6, 0.4, 0.3))),
@@ -50,6 +51,7 @@ COUNTS = [
     ("a form", 60),
     ("a threshold", 60),
     ("an integral", 48),
+    pytest.param("an integral at all times", 120, marks=pytest.mark.system),
     ("a deadline", 48),
     ("an observer", 30),
     pytest.param("an observer", 110, marks=pytest.mark.system),
@@ -85,7 +87,7 @@ def scaled(*keys: str) -> Callable[[Document, Rng], None]:
     """Scale one number of some entries, by a little or by much; a number that is 0 is set."""
 
     def change(document: Document, rng: Rng) -> None:
-        found = places(document["gains"], *keys) or places(document, *keys)
+        found = places(document.get("gains", {}), *keys) or places(document, *keys)
         if found:
             container, key = found[rng.integers(len(found))]
             factor = rng.choice([-1.0, 0.0, 0.5, 0.9, 0.99, 0.999, 1.001, 1.01, 1.1, 2.0, 10.0])
@@ -99,7 +101,7 @@ def all_scaled(*keys: str) -> Callable[[Document, Rng], None]:
 
     def change(document: Document, rng: Rng) -> None:
         factor = rng.choice([0.2, 0.7, 0.98, 0.999, 1.001, 1.02, 1.5, 5.0])
-        for container, key in places(document["gains"], *keys) or places(document, *keys):
+        for container, key in places(document.get("gains", {}), *keys) or places(document, *keys):
             container[key] *= factor
 
     return change
@@ -124,10 +126,12 @@ def swapped(document: Document, rng: Rng) -> None:
 
 
 def another_rule(document: Document, rng: Rng) -> None:
-    """Take the rule for another one, or an integral over more or less."""
+    """Take the rule for another one, or an integral over more or less, or over another time."""
     gains = document["gains"]
-    kind = rng.integers(3)
-    if kind == 0:
+    kind = rng.integers(4) if "window_s" not in gains else 3
+    if kind == 3:
+        gains["window_s"] = gains.get("window_s", 1.0) * rng.choice(_WINDOWS)
+    elif kind == 0:
         gains["by_time"] = not gains.get("by_time", False)
     elif kind == 1:
         gains["tests"] = int(rng.choice([0, 1, 2, 5, 10, 40, 1000]))
@@ -135,6 +139,7 @@ def another_rule(document: Document, rng: Rng) -> None:
         gains["tests"] = float(rng.choice([0.5, 1.0, 12.0]))
 
 
+_WINDOWS = [-1.0, 0.0, 1e-6, 0.02, 0.2, 0.5, 0.9, 1.1, 2.0, 10.0, 1e9, np.inf, np.nan]
 CHANGES: dict[str, Callable[[Document, Rng], None]] = {
     "rate": scaled("rate"),
     "time between events": scaled("inter_event_s"),
@@ -153,6 +158,15 @@ def longest(times: Iterable[fmpq | None]) -> fmpq | None:
     return max((time for time in times if time is not None), default=None)
 
 
+def played(loop: Loop) -> Loop:
+    """Return a loop as runs have it: tests at all times are often, for a little less than the threshold."""
+    if loop.times.sampling > 0:
+        return loop
+    rule, step = loop.rule, fmpq(1, 500)
+    less = rule._replace(level=number(_LESS) * rule.level, floor=number(_LESS) * rule.floor)
+    return loop._replace(rule=less, times=loop.times._replace(sampling=step, least_sampling=step))
+
+
 def require_true(loop: Loop, proofs: list[Proof], seed: int) -> None:
     """Require that runs stay within the least of some proofs of one loop."""
     kinds = {(float(proof.rate.mid()), proof.is_quiet) for proof in proofs}
@@ -165,7 +179,7 @@ def require_true(loop: Loop, proofs: list[Proof], seed: int) -> None:
         )
         for k in range(2):
             rng = np.random.default_rng((seed, k))
-            assert exceeded(loop, together, rng, _SECONDS, by_forms=False) == []
+            assert exceeded(played(loop), together, rng, _SECONDS, by_forms=False) == []
 
 
 def accepted(loop: Loop, document: Document) -> Proof | None:
@@ -188,6 +202,18 @@ def test_changed_documents_prove_nothing_false(name: str, count: int) -> None:
     require_true(loop, proofs, 3)
     assert rejected > count // 8
     assert len({float(bound.decaying + bound.constant) for p in proofs for bound in p.bounds}) > count // 8
+
+
+def test_an_integral_over_any_time_proves_nothing_false() -> None:
+    loop, proofs = BASES["an integral at all times"], []
+    for factor in _WINDOWS:
+        document = copy.deepcopy(base("an integral at all times"))
+        document["gains"]["window_s"] *= factor
+        proof = accepted(loop, document)
+        assert proof is None or 0 < factor < 1e9
+        proofs += [] if proof is None else [proof]
+    assert len({float(bound.constant) for proof in proofs for bound in proof.bounds}) > 2 * len(_OUTPUTS)
+    require_true(loop, proofs, 3)
 
 
 FALSE: dict[str, tuple[str, Callable[[Document], object], str]] = {

@@ -1,0 +1,146 @@
+"""Changed witnesses of times between events: the checker rejects them, or what it accepts is true.
+
+Runs with the shortest times that are found, of loops with one state, decide what is false: a time that is
+longer has to be rejected. Those that are accepted are no longer than the times of all these runs.
+"""
+
+import copy
+import functools
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import fmpq
+
+from noack.theory.witnesses.documents import find_witness, witness_by_gains
+from noack_check.loop import Loop
+from noack_check.proof import Proof, prove
+from tests.checker.shortest import STEP_S, Shortest, shortest_times
+from tests.checker.test_apart import NOISE, steady
+from tests.checker.test_mutations import DOCUMENTS, LOOPS
+from tests.checker.test_mutations_of_gains import CHANGES, accepted, all_scaled, scaled
+from tests.checker.test_witnesses import IDEAL
+
+Document = dict[str, Any]
+Rng = np.random.Generator
+_ROUNDING_S = 1e-9
+_TESTS = IDEAL._replace(sampling=fmpq(1, 50), least_sampling=fmpq(1, 50), delay=fmpq(1, 50))
+BY_GAINS: dict[str, Loop] = {
+    "two losses": steady(2),
+    "a kink": steady(2, level=1.1),
+    "noise": steady(0, disturbance=1.0)._replace(noise=NOISE),
+    "a delay": steady(1, times=IDEAL._replace(delay=fmpq(1, 20))),
+    "tests": steady(1, times=_TESTS),
+}
+BY_DRIFT: dict[str, Loop] = {
+    "a drift": steady(0, disturbance=1.0),
+    "a drift with noise": steady(0, disturbance=1.0)._replace(noise=NOISE),
+    "a first event": steady(0, disturbance=1.0, times=IDEAL._replace(start=fmpq(1, 10))),
+}
+BASES = BY_GAINS | BY_DRIFT
+
+
+@functools.cache
+def base(name: str) -> Document:
+    """Return a document that is accepted: by gains alone, or by the bound of a drift alone."""
+    if name in BY_GAINS:
+        return dict(witness_by_gains(BY_GAINS[name], ("x",)).document)
+    document = dict(find_witness(BY_DRIFT[name], ("x",)).document)
+    del document["gains"]
+    return document
+
+
+@functools.cache
+def shortest(name: str) -> Shortest:
+    return shortest_times(BASES[name])
+
+
+def longer(loop: Loop, proof: Proof, times: Shortest) -> list[str]:
+    """Return which of the times that are proven are longer than those of runs."""
+    room = _ROUNDING_S if loop.times.sampling > 0 else STEP_S
+    pairs = {"between events": (proof.inter_event, times.any if proof.is_quiet else times.later)}
+    if proof.is_quiet:
+        pairs |= {"first event": (proof.first_event, times.first), "quiet": (loop.times.start, times.quiet)}
+    return [
+        f"{name}: {float(stated)} instead of {found}"
+        for name, (stated, found) in pairs.items()
+        if stated is not None and float(stated) > found + room
+    ]
+
+
+def is_longer(document: Document, times: Shortest) -> bool:
+    """Return whether a document states a time that is longer than that of a run."""
+    stated = document | document.get("gains", {})
+    pairs = (("inter_event_s", min(times.first, times.any)), ("first_event_s", times.first))
+    return any(stated.get(key, 0.0) > found + STEP_S for key, found in pairs)
+
+
+# Changes of documents.
+
+TIMES: dict[str, Callable[[Document, Rng], object]] = {
+    "time between events": scaled("inter_event_s"),
+    "first event": scaled("first_event_s"),
+    "both times": all_scaled("inter_event_s", "first_event_s"),
+}
+OF_GAINS, OF_DRIFT = (
+    [change for each in changes.values() for change in (*TIMES.values(), each)]
+    for changes in (CHANGES, DOCUMENTS)
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        ("two losses", 10),
+        ("a first event", 12),
+        *(pytest.param(name, 24, marks=pytest.mark.system) for name in BY_GAINS),
+        *(pytest.param(name, 60, marks=pytest.mark.system) for name in BY_DRIFT),
+    ],
+)
+def test_changed_documents_prove_no_time_that_is_too_long(name: str, count: int) -> None:
+    loop, rng, changes = BASES[name], np.random.default_rng(count), OF_GAINS if name in BY_GAINS else OF_DRIFT
+    assert prove(loop, base(name))
+    tried = rejected = false = 0
+    for change in itertools.cycle(changes):
+        document = copy.deepcopy(base(name))
+        change(document, rng)
+        if document == base(name):
+            continue
+        tried += 1
+        proof = accepted(loop, document)
+        if proof is None:
+            rejected += 1
+            false += is_longer(document, shortest(name))
+        else:
+            assert longer(loop, proof, shortest(name)) == []
+        if tried == count:
+            break
+    assert count // 12 <= false <= rejected < count
+
+
+# Changes of loops, of which a document states a time.
+
+
+def changed_loops(name: str) -> Iterator[Loop]:
+    for seed, change in enumerate(LOOPS.values()):
+        loop = change(BASES[name], np.random.default_rng(seed))
+        if repr(loop) != repr(BASES[name]):
+            yield loop
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name == "a drift" else pytest.mark.system) for name in BASES],
+)
+def test_changed_loops_have_no_time_that_is_too_long(name: str) -> None:
+    proven = rejected = 0
+    for loop in changed_loops(name):
+        proof = accepted(loop, base(name))
+        if proof is None:
+            rejected += 1
+        else:
+            proven += 1
+            assert longer(loop, proof, shortest_times(loop)) == []
+    assert min(proven, rejected) > 2
