@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from math import lcm
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +34,11 @@ LONGEST = 7
 
 def delayed(delay_s: float) -> str:
     return f"network.impairments=[{{kind='delay', delay_s={delay_s}}}]"
+
+
+def within(losses: int, window: int) -> tuple[str, str]:
+    limit = f"{{kind='at_most', losses={losses}, window={window}}}"
+    return "network.mansd=9", f"network.constraints=[{limit}]"
 
 
 def scenario(name: str, *settings: str) -> Scenario:
@@ -112,7 +118,7 @@ def accepted(loop: PeriodicLoop) -> tuple[dict[str, object], float]:
         ("lane_periodic", ()),
         ("lane_periodic", ("network.mansd=6",)),
         ("lane_periodic", ("mode=zoh",)),
-        ("lane_periodic", ("network.mansd=9", "network.constraints=[{kind='at_most', losses=3, window=5}]")),
+        ("lane_periodic", within(3, 5)),
         ("double_integrator", (PERIODIC, "controller.rate_hz=16", delayed(0.07))),
         ("double_integrator", (PERIODIC, delayed(0.25))),
         ("unstable_pendulum", ("trigger={policy='periodic', period_s=0.05}",)),
@@ -257,6 +263,41 @@ def test_what_is_accepted_of_changed_patterns_grows() -> None:
         found.append(float(what.lower))
     assert 40 < len(found) < 160
     assert min(found) < 1 < max(found)
+
+
+@pytest.mark.parametrize("settings", [("double_integrator", PERIODIC), UNSTABLE])
+def test_what_is_accepted_of_other_windows_is_true(settings: Sequence[str]) -> None:
+    """A guarantee allows so many losses in so many successive updates; with others it is another loop."""
+    content = resolved_content(scenario(*settings, *within(2, 5)))
+    document, proven, rejected = accepted(read_periodic_loop(content))[0], 0, 0
+    for number, (most, window) in enumerate(product(range(5), range(1, 8))):
+        limits = [{"kind": "at_most", "losses": most, "window": window}]
+        loop = read_periodic_loop({**content, "network": content["network"] | {"constraints": limits}})
+        losses = min(loop.guarantee.losses, 2 + number % 2)
+        try:
+            what = prove_growth(loop, with_forms_for(loop, {**document, "losses": losses}))
+        except RejectedError:
+            rejected += 1
+            continue
+        proven += 1
+        checked = loop.under(loop.guarantee._replace(losses=losses))
+        if what.upper is not None:
+            assert worst_growth(checked)[0] <= float(what.upper)
+        else:
+            assert what.lower is not None
+            assert allows(checked, what.pattern * (2 + window))
+            assert float(what.lower) <= growth_of(checked, what.pattern) * (1 + 1e-9)
+    assert min(proven, rejected) > 8
+
+
+def with_forms_for(loop: PeriodicLoop, document: dict[str, Any]) -> dict[str, object]:
+    """Return a document with as many forms as a loop needs: an inequality decides, not their number."""
+    if "stable" not in document:
+        return document
+    checked, table = loop.under(loop.guarantee._replace(losses=document["losses"])), document["stable"]
+    nodes = {burst.source for burst in checked.bursts}
+    forms = [table["forms"][node % len(table["forms"])] for node in range(len(nodes))]
+    return {**document, "stable": table | {"forms": forms}}
 
 
 def stable() -> tuple[PeriodicLoop, dict[str, object]]:
