@@ -9,13 +9,17 @@ from flint import arb, fmpq
 
 from cosim.analysis.certificates import Certificates
 from noack.theory.witnesses import semidefinite
-from noack.theory.witnesses.coordinates import floats
+from noack.theory.witnesses.assumptions import first_assumptions
+from noack.theory.witnesses.coordinates import floats, simulated_frames
 from noack.theory.witnesses.documents import find_witness
 from noack.theory.witnesses.effort import Effort, NoWitnessError, WorkLimitError
 from noack.theory.witnesses.line_search import search_lowest
+from noack.theory.witnesses.search import Search
+from noack.theory.witnesses.semidefinite import Accuracy
 from noack.theory.witnesses.templates import Templates
 from noack_check.balls import matrix, number
 from noack_check.model import Model
+from noack_check.proof import read_assumptions
 from tests.checker.test_witnesses import IDEAL, bounds_of, double_integrator
 from tests.helpers.shipped import resolved
 
@@ -119,6 +123,42 @@ def test_a_rate_of_a_similar_loop_with_which_nothing_is_found_is_left() -> None:
     assert bounds_of(find_witness(loop, (), near=[by_gains])) == bounds_of(alone)
 
 
+def test_a_small_rate_is_tried_where_larger_ones_have_no_forms() -> None:
+    found = find_witness(double_integrator()._replace(half_B=matrix([[0.0], [0.3]])), ("x",))
+    assert "bounds" in found.document
+    assert bounds_of(found)["x"] < 4
+
+
+def test_a_search_without_forms_says_which_inequality_fails_first_and_by_how_much() -> None:
+    too_uncertain = double_integrator()._replace(half_B=matrix([[0.0], [0.6]]))
+    with pytest.raises(
+        NoWitnessError, match=r"no quadratic forms \(first fails flow/2 lost/0/0, by 9\.\d V\)"
+    ):
+        find_witness(too_uncertain, ("x",))
+
+
+def test_inequalities_that_have_a_solution_are_not_missed() -> None:
+    loop = double_integrator()
+    document = {**first_assumptions(loop, 0.3), "rate": 0.3}
+    assumed = read_assumptions(loop, number(0.3), document)
+
+    def model(decay: float) -> Model:
+        return Model(loop, number(0.3), number(decay), assumed.errors, **assumed.of_model, is_exact=False)
+
+    templates = Templates(model)
+    search, accuracy = (
+        Search(templates, simulated_frames(templates.model)),
+        Accuracy(1e-3, 1e-3, improves_steps=False),
+    )
+    possible = search.shortfall("x", 0.8, starts=True, accuracy=accuracy)
+    assert possible is not None
+    assert possible.share < 1e-3
+    impossible = search.shortfall("x", 20.0, starts=True, accuracy=accuracy)
+    assert impossible is not None
+    assert impossible.share > 1
+    assert impossible.name.startswith("flow/")
+
+
 def test_progress_rises_to_its_end() -> None:
     shares: list[float] = []
     find_witness(double_integrator(), progress=shares.append)
@@ -156,7 +196,7 @@ def test_steps_are_improved_where_rounding_errors_end_the_solver(monkeypatch: py
         self: semidefinite._Problem,
         objective: Mapping[str, float],
         free: set[str],
-        accuracy: semidefinite.Accuracy,
+        accuracy: Accuracy,
     ) -> semidefinite.SolverAnswer:
         improved.append(accuracy.improves_steps)
         answer = solve(self, objective, free, accuracy)
@@ -164,7 +204,7 @@ def test_steps_are_improved_where_rounding_errors_end_the_solver(monkeypatch: py
 
     monkeypatch.setattr(semidefinite._Problem, "solve", first_fails)
     one = semidefinite.MatrixInequality((), (("level 1", np.eye(1)),), -np.eye(1))
-    accuracy = semidefinite.Accuracy(gap=1e-6, feasibility=1e-6, improves_steps=False)
+    accuracy = Accuracy(gap=1e-6, feasibility=1e-6, improves_steps=False)
     answer = semidefinite.minimise({"level 1": 1.0}, [one], margin=0.0, accuracy=accuracy)
     assert answer.is_solved
     assert answer.numbers["level 1"] == pytest.approx(1, rel=1e-3)

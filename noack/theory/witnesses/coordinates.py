@@ -29,7 +29,7 @@ _LOSS_RATES = (0.0, 0.3, 0.6, 0.9, 1.0)
 
 def floats(M: arb_mat) -> Matrix:
     """Return the midpoints."""
-    return np.array([[float(v.mid()) for v in row] for row in M.tolist()]).reshape(M.nrows(), M.ncols())
+    return np.array([float(v) for v in M.entries()]).reshape(M.nrows(), M.ncols())
 
 
 def simulated_frames(model: Model) -> Frames:

@@ -45,8 +45,10 @@ _ATTEMPTS_BY_TESTS = (
 )
 """Those of forms of each test, in which V changes little from test to test."""
 _COARSE_MARGIN = 1e-6
-_FIRST_SHARE, _FIRST_SLOW_SHARE, _FIRST_CLOCK_SHARE = 0.42, 0.04, 0.02
+_FIRST_SHARE, _FIRST_SLOW_SHARE, _SMALLEST_SHARE = 0.42, 0.04, 0.02
 """ν is between 2r and twice the loop's rate of decay, at a share."""
+_SMALL_SHARE = 0.05
+"""Where the first shares have no solution; so in loops whose plant is known roughly."""
 _MOST_TRIES, _FEW_TRIES, _LARGE = 5, 2, 1.0
 """Shares that are tried for an output, also for a problem that is large: its work is above a limit."""
 _ROOM, _NEAR = 1 + 1e-6, 1.04
@@ -240,11 +242,12 @@ def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort, tried: Sequence[int] 
     if loop.rule.memory is not None and loop.holds:  # x_s rests, and where xᵀPB = 0 K e_s may have any size
         raise NoWitnessError("trigger.policy: a dynamic rule bounds no held input; one with a deadline does")
     fastest = min((each["rate"] for each in wanted.near if isinstance(each["rate"], float)), default=math.inf)
+    last: tuple[_OutputSearch, str] | None = None
     for pieces in tried or (_PIECES_OF_TESTS if by_tests else _PIECES):
         for rates in (_Rates(loop, slow=share, by_tests=by_tests) for share in (0.3, 0.02)):
             if rates.rate > fastest:
                 continue
-            rates.first_share, rates.moves = _FIRST_CLOCK_SHARE, (0,)
+            rates.first_share, rates.moves = _SMALLEST_SHARE, (0,)
             document = {**first_assumptions(loop, rates.rate), "pieces": pieces}
             if by_tests:
                 document["by_tests"] = True
@@ -252,12 +255,16 @@ def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort, tried: Sequence[int] 
             search = _OutputSearch(loop, rates, document, rates.shares(wanted.near), effort)
             has_errors = not by_tests or loop.seen is None
             outputs = [output for output in wanted.outputs if has_errors or not output.startswith("e_")]
-            if not outputs or not search.has_solution(outputs[0]):
+            if not outputs:
                 continue
-            bounds = search.bounds(wanted._replace(outputs=outputs))
-            if bounds:
+            last = search, outputs[0]
+            if search.has_solution(outputs[0]) and (
+                bounds := search.bounds(wanted._replace(outputs=outputs))
+            ):
                 return search.witness(document, bounds, wanted)
-    raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
+    if last is None:
+        raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
+    raise last[0].failure(last[1], starts=True)
 
 
 Shares = dict[tuple[str, bool], float]
@@ -431,24 +438,38 @@ class _OutputSearch:
                 yield index > 1, found
             search = Search(self._templates, refined(search.frames, last))
 
+    def failure(self, output: str, *, starts: bool) -> NoWitnessError:
+        """Return why an output has no bound: what was assumed, and the inequality that fails first."""
+        if (output, starts) in self._best:
+            return NoWitnessError(f"{output}: the quadratic forms that the solver finds are not proven")
+        return NoWitnessError(f"{output}: {self._nothing_found()}{self._first_missed(output, starts=starts)}")
+
     def _nothing_found(self) -> str:
-        """Return that there is no solution, and what was assumed."""
         later = self._assumed.later
         events = f" with {later} later event{'s' * (later > 1)}" if later else ""
         return f"the solver finds no quadratic forms{events}"
 
+    def _first_missed(self, output: str, *, starts: bool) -> str:
+        """Return the inequality that is missed by most for the smallest ν, if the problem is not large."""
+        work = self._templates.work(output)
+        if self._is_rough or work > _LARGE:
+            return ""
+        self._effort.add(output, work)
+        decay = self._rates.decay(_SMALLEST_SHARE)
+        missed = self._search.shortfall(output, decay, starts=starts, accuracy=_COARSE)
+        if missed is None or missed.share < _COARSE.gap:  # not distinct from the solver's errors
+            return ""
+        return f" (first fails {missed.name}, by {missed.share:.2g} V)"
+
     def best_share(self, output: str, *, starts: bool) -> tuple[float, Found]:
-        """Return the share for ν with its coarse solution."""
-        key = output, starts
-        if key not in self._best:
-            found = self._tried(output, starts=starts)
-            if not found:
-                raise NoWitnessError(f"{output}: {self._nothing_found()}")
-            best = min(found, key=lambda share: found[share].size)
-            self._share = self._share or best
-            self._best[key] = best, found[best]
-            self._shares[key] = best
-        return self._best[key]
+        """Return the share for ν with its coarse solution.
+
+        Raises:
+            NoWitnessError: there is none.
+        """
+        if not self.has_solution(output, starts=starts):
+            raise self.failure(output, starts=starts)
+        return self._best[output, starts]
 
     def decays(self) -> list[dict[str, object]]:
         """Return for each output that was searched its ν, as in the entry of a document."""
@@ -457,14 +478,17 @@ class _OutputSearch:
             for (output, starts), (share, _) in self._best.items()
         ]
 
-    def has_solution(self, output: str) -> bool:
-        """Return whether the solver finds forms that bound an output from the start on."""
-        try:
-            self.best_share(output, starts=True)
-        except WorkLimitError:
-            raise
-        except NoWitnessError:
-            return False
+    def has_solution(self, output: str, *, starts: bool = True) -> bool:
+        """Return whether the solver finds forms that bound an output."""
+        key = output, starts
+        if key not in self._best:
+            found = self._tried(output, starts=starts)
+            if not found:
+                return False
+            best = min(found, key=lambda share: found[share].size)
+            self._share = self._share or best
+            self._best[key] = best, found[best]
+            self._shares[key] = best
         return True
 
     def _tried(self, output: str, *, starts: bool) -> dict[float, Found]:
@@ -493,6 +517,8 @@ class _OutputSearch:
             most = 1 if self._share else _FEW_TRIES
         first, upwards = self._share or self._rates.first_share, not self._share
         search_lowest(size, first, most, upwards=upwards, moves=self._rates.moves)
+        if not found and first == _FIRST_SHARE:
+            search_lowest(size, _SMALL_SHARE, most, upwards=True, moves=(0, -2))
         return found
 
     def _is_direct(self, output: str, *, starts: bool) -> bool:

@@ -4,7 +4,7 @@ from noack.core.progress import Progress
 
 MOST_WORK = 20.0
 """A search ends after so many 10⁹ products per step of the solver: some minutes."""
-_MOST_PER_PROBLEM = 2.0
+MOST_PER_PROBLEM = 2.0
 """A larger problem takes minutes, and seldom ends well: those of the F-16 under its schedule are 12 to 14.
 In eleven shipped scenarios with a proof the largest one is 0.5."""
 _LAST_SHARE = 0.99
@@ -16,6 +16,14 @@ class NoWitnessError(ArithmeticError):
 
 class WorkLimitError(NoWitnessError):
     """The search has reached its limit of work."""
+
+
+def too_large(work: float) -> WorkLimitError:
+    """Return that a problem needs, or its first inequalities alone need, so many 10⁹ products per step."""
+    return WorkLimitError(
+        f"the loop's inequalities are too large for the search ({work:.2g} · 10⁹ products a step or more, "
+        f"at most {MOST_PER_PROBLEM:g} · 10⁹)"
+    )
 
 
 class Effort:
@@ -40,11 +48,8 @@ class Effort:
         Raises:
             WorkLimitError: it is one too many, or too large.
         """
-        if work > _MOST_PER_PROBLEM:
-            raise WorkLimitError(
-                f"{output}: its inequalities are too large for the search ({work:.2g} · 10⁹ products a step, "
-                f"at most {_MOST_PER_PROBLEM:g} · 10⁹)"
-            )
+        if work > MOST_PER_PROBLEM:
+            raise too_large(work)
         if self._work + work > self._most_work:
             raise WorkLimitError(
                 f"{output}: the search ended after {self._problems} problems, at its limit of work"

@@ -18,6 +18,9 @@ _CONSTANT_WEIGHT = 100.0
 """Of D₂² of an output."""
 FREE = ("c", "eta")
 """Numbers with such names may be negative."""
+_SHORT = "short by/"
+_LEVEL_WEIGHT = 1e-9
+"""Of D₁² and D₂² where shortfalls are minimised."""
 
 
 class Found(NamedTuple):
@@ -33,6 +36,17 @@ class Found(NamedTuple):
         """D₁ and D₂."""
         decaying, constant = (max(self.numbers.get(f"level {i}", 0.0), 0.0) ** 0.5 for i in (1, 2))
         return decaying, constant
+
+
+class Shortfall(NamedTuple):
+    """The inequality (·) ⪰ 0 that is missed by most: (·) + ``share`` · 1 ⪰ 0 is possible.
+
+    The coordinates are those of the search, in which states of simulated runs and the bounded output have
+    about the size 1.
+    """
+
+    name: str
+    share: float
 
 
 class Search:
@@ -57,24 +71,41 @@ class Search:
         by the thresholds c and f of their units: the time between events depends on these quotients.
         """
         size = self._output_size(output)
-        items = self.templates.at(decay, output, starts=starts)
-        problem = [self._scaled(item, size) for item in items]
+        problem = [self._scaled(item, size) for item in self.templates.at(decay, output, starts=starts)]
         units = _units(problem)
-        problem = [
-            item._replace(scalars=tuple((name, units[name] * M) for name, M in item.scalars))
-            for item in problem
-        ]
         weights = self._weights(output, starts=starts)
         objective = {name: weight * units[name] for name, weight in weights.items() if name in units}
         largest = max(objective.values())
         objective = {name: w / largest for name, w in objective.items()}
-        free = {name for name in units if name.startswith(FREE)}
-        solution = minimise(objective, problem, free=free, margin=margin, accuracy=accuracy)
+        solution = _solved(objective, problem, units, margin, accuracy)
         if not solution.is_solved:
             return None
         found = self._unscaled(solution, size, units)
         squares = (weights[name] * max(found.numbers.get(name, 0.0), 0.0) for name in weights)
         return found._replace(size=sum(squares) ** 0.5)
+
+    def shortfall(self, output: str, decay: float, *, starts: bool, accuracy: Accuracy) -> Shortfall | None:
+        """Return which inequality is missed by most if the sum of all shortfalls is as small as possible.
+
+        The inequalities of the output are met: they say how large V is. None: the solver fails.
+        """
+        size = self._output_size(output)
+        items = self.templates.at(decay, output, starts=starts)
+        problem, names = [], {}
+        for item in items:
+            scaled = self._scaled(item, size)
+            if not item.name.startswith("output/"):
+                names[f"{_SHORT}{item.name}"] = item.name
+                slack = f"{_SHORT}{item.name}", np.eye(len(scaled.constant))
+                scaled = scaled._replace(scalars=(*scaled.scalars, slack))
+            problem.append(scaled)
+        units = _units(problem)
+        levels = {name: _LEVEL_WEIGHT for name in self._weights(output, starts=starts) if name in units}
+        solution = _solved({**dict.fromkeys(names, 1.0), **levels}, problem, units, 0.0, accuracy)
+        if not solution.is_solved:
+            return None
+        worst = max(names, key=lambda name: solution.numbers[name])
+        return Shortfall(names[worst], solution.numbers[worst])
 
     def _weights(self, output: str, *, starts: bool) -> Mapping[str, float]:
         """Return the weights of D₁² and D₂²."""
@@ -137,6 +168,21 @@ class Search:
             matrices[name] = size**2 * inverse.T @ V @ inverse
         numbers = {name: size**2 * units[name] * value for name, value in solution.numbers.items()}
         return Found(matrices, numbers, 0.0)
+
+
+def _solved(
+    objective: Mapping[str, float],
+    problem: list[MatrixInequality],
+    units: Mapping[str, float],
+    margin: float,
+    accuracy: Accuracy,
+) -> SolverAnswer:
+    """Return the solver's answer, with numbers in their units."""
+    problem = [
+        item._replace(scalars=tuple((name, units[name] * M) for name, M in item.scalars)) for item in problem
+    ]
+    free = {name for name in units if name.startswith(FREE)}
+    return minimise(objective, problem, free=free, margin=margin, accuracy=accuracy)
 
 
 def refined(frames: Frames, found: Found) -> Frames:

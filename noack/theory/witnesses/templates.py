@@ -8,6 +8,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix
 from noack.theory.witnesses.coordinates import floats
+from noack.theory.witnesses.effort import MOST_PER_PROBLEM, too_large
 from noack_check.model import Inequality, Model, Part
 
 _PER_ENTRY = 20_000
@@ -17,6 +18,7 @@ _LOW, _HIGH = 1.0, 2.0
 class Template(NamedTuple):
     """An inequality as :class:`noack_check.model.Inequality`, in floating point."""
 
+    name: str
     location: int
     signals: int
     parts: tuple[tuple[str, Matrix, Matrix], ...]
@@ -29,11 +31,18 @@ class Templates:
 
     Args:
         make: returns the model for a ν.
+
+    Raises:
+        WorkLimitError: there are too many.
     """
 
     def __init__(self, make: Callable[[float], Model]) -> None:
         self.model = make(_LOW)
-        self._low = [_template(item) for item in self.model.common_inequalities()]
+        self._low: list[Template] = []
+        for item in self.model.common_inequalities():
+            self._low.append(_template(item))
+            if (work := _work(self._low)) > MOST_PER_PROBLEM:
+                raise too_large(work)
         flows = takewhile(lambda item: item.name.startswith("flow/"), make(_HIGH).common_inequalities())
         self._high = [_template(item) for item in flows]
         self._outputs: dict[str, list[Template]] = {}
@@ -49,18 +58,25 @@ class Templates:
         return [*flows, *self._low[len(self._high) :], *self._outputs[output], *start]
 
     def work(self, output: str) -> float:
-        """Return about how many 10⁹ products the solver needs per step to bound an output.
+        """Return about how many 10⁹ products the solver needs per step to bound an output."""
+        return _work(self.at(_LOW, output, starts=False))
 
-        What it needs for each entry of an inequality counts as some thousand products.
-        """
-        sizes = [len(item.constant) for item in self.at(_LOW, output, starts=False)]
-        entries = [q * (q + 1) / 2 for q in sizes]
-        return sum(count**3 + _PER_ENTRY * count for count in entries) / 1e9
+
+def _work(items: Iterable[Template]) -> float:
+    """Return about how many 10⁹ products the solver needs per step.
+
+    What it needs for each entry of an inequality counts as some thousand products.
+    """
+    sizes = [len(item.constant) for item in items]
+    entries = [q * (q + 1) / 2 for q in sizes]
+    return sum(count**3 + _PER_ENTRY * count for count in entries) / 1e9
 
 
 def _template(item: Inequality) -> Template:
     scalars = tuple((name, floats(M)) for name, M in item.scalars)
-    return Template(item.location, item.signals, _merged(item.parts), scalars, floats(item.constant))
+    return Template(
+        item.name, item.location, item.signals, _merged(item.parts), scalars, floats(item.constant)
+    )
 
 
 def _merged(parts: Iterable[Part]) -> tuple[tuple[str, Matrix, Matrix], ...]:
