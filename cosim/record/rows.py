@@ -29,6 +29,8 @@ some are given, at least with these."""
 
 BATCH_ROWS = 16_384
 """A table of at most this many rows is read whole; a longer one in parts of this size."""
+_LOOKED_AT = 4096
+"""Rows that are looked at together for the end of a part."""
 _TIMES = ("t_ns", "now_ns", "since_ns", "release_ns", "copy_ns")
 """Columns with times, which are those of the run or of a loop."""
 _MAY_BE_NEVER = ("release_ns", "copy_ns")
@@ -110,14 +112,25 @@ def _split_at(end_ns: int, rows: Rows, reader: Iterator[Rows]) -> tuple[Rows, Ro
     """Return the next rows up to the first one that is not before ``end_ns``, and those after them."""
     parts: list[Rows] = []
     while True:
-        later = rows["now_ns"] >= end_ns
-        count = int(np.argmax(later)) if later.any() else len(rows)
+        count = _count_before(end_ns, rows["now_ns"])
         if count:  # a part of its own need not be copied
             parts.append(rows[:count])
         rows = rows[count:]
         if len(rows) or (batch := next(reader, None)) is None:
             return concatenate_rows(parts or [rows[:0]], rows.dtype), rows
         rows = batch
+
+
+def _count_before(end_ns: int, times_ns: NDArray[np.int64]) -> int:
+    """Return the number of times up to the first one that is not before ``end_ns``.
+
+    Little more than those is looked at: a record in memory has all rows of a table in one array.
+    """
+    for begin in range(0, len(times_ns), _LOOKED_AT):
+        later = times_ns[begin : begin + _LOOKED_AT] >= end_ns
+        if later.any():
+            return begin + int(np.argmax(later))
+    return len(times_ns)
 
 
 def with_loop(rows: Rows, number: int, dtype: np.dtype[np.void]) -> Rows:
