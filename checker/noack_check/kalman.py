@@ -54,7 +54,7 @@ class KalmanFilter:
         start: covariance before the first measurement, (n, n).
 
     Raises:
-        RefusedError: matrices do not fit.
+        RefusedError: matrices do not fit, or a covariance is not symmetric.
     """
 
     def __init__(
@@ -64,6 +64,8 @@ class KalmanFilter:
         for key, M, size in (("Q", added, n), ("R", R, p), ("initial_std", start, n)):
             if (M.nrows(), M.ncols()) != (size, size):
                 raise RefusedError(f"observer.{key}: not of {size} rows and columns")
+            if not M.overlaps(transpose(M)):
+                raise RefusedError(f"observer.{key}: not symmetric")
         self._n, self._C, self._R, self._start = n, C, _symmetric(R), start
         step, power = _Step(identity(n), zeros(n, n)), _Step(flow, _symmetric(added))
         for bit in range(steps.bit_length()):

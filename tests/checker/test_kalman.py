@@ -152,6 +152,19 @@ def test_what_is_no_filter_is_refused(change: dict[str, Any]) -> None:
         read_loop(tables, box=False, ideal=False)
 
 
+@pytest.mark.parametrize("key", ["Q", "R"])
+def test_a_covariance_that_is_not_symmetric_is_refused(key: str) -> None:
+    """The filter's gains would be those of another matrix than the scenario's."""
+    tables = resolved_tables(SCENARIO, "plant.measurement={C=[[1.0,0.0],[1.0,2.0]],noise_std=[0.002,0.1]}")
+    M = tables["observer"][key]
+    M[0][1] += 1e-12
+    with pytest.raises(RefusedError, match=rf"observer\.{key}: not symmetric"):
+        read_loop(tables, box=False, ideal=False)
+    M[1][0] += 1e-12
+    M[0][1] = M[1][0]
+    assert read_loop(tables, box=False, ideal=False).observer is not None
+
+
 # Documents and runs.
 
 
