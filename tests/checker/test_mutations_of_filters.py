@@ -340,7 +340,11 @@ def test_any_part_of_the_error_that_decays_smoothly_leaves_a_bound_of_the_rest(c
         S, Λ = rng.normal(size=(2, q)), np.zeros((q, q)) - np.diag(rng.uniform(0.0, 9.0, q))
         s = 10.0 ** rng.integers(-3, 1) * rng.normal(size=(q, 1))
         if q == 2 and rng.random() < 0.5:
-            S, Λ, s = np.eye(2), F + 0.5 * rng.normal(size=(2, 2)), start[:, None] * rng.uniform(0.8, 1.2, (2, 1))
+            S, Λ, s = (
+                np.eye(2),
+                F + 0.5 * rng.normal(size=(2, 2)),
+                start[:, None] * rng.uniform(0.8, 1.2, (2, 1)),
+            )
         table = {"columns": S.tolist(), "rates": Λ.tolist(), "start": s.tolist()}
         rate = float(rng.choice([0.0, 0.1, 0.4]))
         try:

@@ -15,12 +15,13 @@ import pytest
 from flint import fmpq
 
 from noack.theory.witnesses.documents import find_witness, witness_by_gains
-from noack_check.loop import Loop
+from noack_check.balls import identity, number
+from noack_check.loop import Loop, Times
 from noack_check.proof import Proof, prove
 from tests.checker.shortest import STEP_S, Shortest, shortest_times
 from tests.checker.test_apart import NOISE, steady
 from tests.checker.test_mutations import DOCUMENTS, LOOPS
-from tests.checker.test_mutations_of_gains import CHANGES, accepted, all_scaled, scaled
+from tests.checker.test_mutations_of_gains import CHANGES, accepted, all_scaled, places, scaled
 from tests.checker.test_witnesses import IDEAL
 
 Document = dict[str, Any]
@@ -34,10 +35,20 @@ BY_GAINS: dict[str, Loop] = {
     "a delay": steady(1, times=IDEAL._replace(delay=fmpq(1, 20))),
     "tests": steady(1, times=_TESTS),
 }
+
+
+def pushed(times: Times = IDEAL) -> Loop:
+    """Return ẋ = −x + 0.02 x_c + d, |d| ≤ 1: nearly all that moves e_s is d. An event needs |e_s| > 0.5."""
+    loop, one = steady(0, disturbance=1.0, times=times), identity(1)
+    return loop._replace(
+        A=-1 * one, model_A=-1 * one, gain=number(0.01) * one, rule=loop.rule._replace(floor=number(0.5))
+    )
+
+
 BY_DRIFT: dict[str, Loop] = {
-    "a drift": steady(0, disturbance=1.0),
-    "a drift with noise": steady(0, disturbance=1.0)._replace(noise=NOISE),
-    "a first event": steady(0, disturbance=1.0, times=IDEAL._replace(start=fmpq(1, 10))),
+    "a drift": pushed(),
+    "a drift with noise": pushed()._replace(noise=NOISE),
+    "a first event": pushed(IDEAL._replace(start=fmpq(1, 10))),
 }
 BASES = BY_GAINS | BY_DRIFT
 
@@ -79,10 +90,19 @@ def is_longer(document: Document, times: Shortest) -> bool:
 
 # Changes of documents.
 
+
+def _near(document: Document, rng: Rng) -> None:
+    found = places(document.get("gains", document), "inter_event_s", "first_event_s")
+    container, key = found[rng.integers(len(found))]
+    container[key] *= float(rng.uniform(0.95, 1.7))
+
+
 TIMES: dict[str, Callable[[Document, Rng], object]] = {
     "time between events": scaled("inter_event_s"),
     "first event": scaled("first_event_s"),
     "both times": all_scaled("inter_event_s", "first_event_s"),
+    "a time near the true one": _near,
+    "another time near it": _near,
 }
 OF_GAINS, OF_DRIFT = (
     [change for each in changes.values() for change in (*TIMES.values(), each)]

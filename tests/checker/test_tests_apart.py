@@ -285,15 +285,39 @@ def test_forms_of_each_test_need_tests_at_exact_times() -> None:
         prove(loop, {"rate": 0.0, "by_tests": True, "bounds": []})
 
 
+def of_memory(field: str, factor: float) -> Callable[[Loop, np.random.Generator], Loop]:
+    def change(loop: Loop, rng: np.random.Generator) -> Loop:
+        memory = loop.rule.memory
+        return (
+            loop if memory is None else with_memory(loop, **{field: getattr(memory, field) * number(factor)})
+        )
+
+    return change
+
+
+def with_dwell(factor: fmpq) -> Callable[[Loop, np.random.Generator], Loop]:
+    return lambda loop, rng: loop._replace(times=loop.times._replace(dwell=loop.times.dwell * factor))
+
+
+OF_LOOPS = OTHER_LOOPS | {
+    "another decay of the memory": of_memory("decay", 0.9),
+    "another gain of the memory": of_memory("gain", 1.1),
+    "another start of the memory": of_memory("start", 1.5),
+    "a longer dwell time": with_dwell(fmpq(6, 5)),
+    "a shorter dwell time": with_dwell(fmpq(4, 5)),
+    "no dwell time": with_dwell(fmpq(0)),
+}
+
+
 @pytest.mark.system
 @pytest.mark.parametrize("name", LOOPS)
-@pytest.mark.parametrize("change", [*DOCUMENTS, *OTHER_LOOPS])
+@pytest.mark.parametrize("change", [*DOCUMENTS, *OF_LOOPS])
 def test_what_is_accepted_of_changed_witnesses_is_true(name: str, change: str) -> None:
     """Random runs stay within what was accepted."""
     loop, witness = base(name)
     for seed in range(2):
         rng, document = np.random.default_rng(seed), copy.deepcopy(dict(witness.document))
-        changed = OTHER_LOOPS[change](loop, rng) if change in OTHER_LOOPS else loop
+        changed = OF_LOOPS[change](loop, rng) if change in OF_LOOPS else loop
         if change in DOCUMENTS:
             if change == "outputs swapped" and len(document["bounds"]) < 2:  # type: ignore[arg-type]
                 continue
