@@ -70,6 +70,8 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
         RefusedError: a key of the scenario is not covered.
     """
     scenario, statements = file.get("scenario"), file.get("statements")
+    if given == {}:
+        raise RejectedError("--scenario: the file has no key")
     if not isinstance(scenario, Mapping) or not isinstance(statements, list) or not statements:
         raise RejectedError("the file has no scenario, or no statements")
     if given is not None and (different := _differences(given, scenario)):

@@ -611,8 +611,10 @@ class Gains:
         counts = {"x": loop.n, "u": loop.B.ncols(), "y": loop.output_rows.nrows()}
         entries = {f"{kind}[{i}]" for kind, count in counts.items() for i in range(count)}
         outputs = table.get("outputs")
-        if not isinstance(outputs, list) or not {"x", "e_s", "e_c"} | entries >= {*map(str, outputs)}:
-            raise RejectedError("gains: outputs: not a list of the loop's")
+        if not isinstance(outputs, list):
+            raise RejectedError("gains: outputs: not a list")
+        if unknown := {*map(str, outputs)} - entries - {"x", "e_s", "e_c"}:
+            raise RejectedError(f"gains: outputs: {min(unknown)[:50]!r} is none of the loop's")
         self._outputs = [*map(str, outputs)]
         self._responses: dict[bool, _Responses] = {}
         self.units: list[UnitGains] = []

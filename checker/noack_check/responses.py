@@ -42,10 +42,12 @@ class Decay(NamedTuple):
 
     def require(self, M: arb_mat, name: str) -> None:
         """Raise RejectedError if this is not proven of a matrix."""
+        if not self.rate > 0:
+            raise RejectedError(f"{name}: its rate of decay is not above 0")
         P = self.form
         falls = -1 * (transpose(M) * P + P * M + 2 * self.rate * P)
         has_inverse = all(P[i, i] > 0 for i in range(P.nrows()))  # beside is_positive
-        if not (self.rate > 0 and has_inverse and is_positive(P) and is_positive(falls)):
+        if not (has_inverse and is_positive(P) and is_positive(falls)):
             raise RejectedError(f"{name}: not proven to decay so fast")
 
 

@@ -7,7 +7,7 @@ from cosim.analysis.adversary.worst_disturbances import disturbance_bounds
 from cosim.output.document import Block, Document, Sentence, SentenceRole
 from cosim.output.result_tables import ResultTable, Tone
 from noack.core.clock import NS_PER_S
-from noack.core.number_format import NONE, at_least, at_most, duration, number
+from noack.core.number_format import NONE, at_least, at_most, counted, duration, number
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import network_delay_ns
@@ -73,7 +73,10 @@ def _pattern(worst: WorstRun) -> Iterator[Block]:
     """Yield how the worst run was found, and its losses."""
     time_text = "" if worst.at_s is None else f"worst at {worst.at_s:.6f} s; "
     coverage = "all patterns searched" if worst.exact else "not all patterns searched"
-    speed = f"{worst.runs:,} runs; {worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f} per second"
+    speed = (
+        f"{counted(worst.runs, 'run')}; {counted(worst.nodes, 'segment')}, "
+        f"{worst.nodes / worst.elapsed_s:,.0f} per second"
+    )
     outcome = "the loop diverges" if worst.diverges else f"{time_text}{coverage} ({speed})"
     yield _prose(f"{worst.objective.value}: {outcome}")
     yield Sentence(text=f"  {worst.text}")
@@ -96,9 +99,9 @@ def _notes(
     if any(worst.tightness is not None for worst in results):
         yield _note("share used: of the certified bound, by the worst losses")
     if _is_shaped(certificate):
-        yield _note("Scaled: multiplied by bound(0) / bound(t)")
+        yield _note("scaled: multiplied by bound(0) / bound(t)")
     if certificate.void is not None and not certificate.exists:
-        yield _note(f"Nothing is certified: {certificate.void}")
+        yield _note(f"nothing is certified: {certificate.void}")
     else:
         yield _note("certified: proved for the scenario's schedule")
     yield _note("One letter per event: D delivered, L lost. --json prints their times")

@@ -163,7 +163,8 @@ REJECTED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
         lambda document: document["gains"]["plant"].update(decay=2.0), "plant: not proven to decay",
     ),
     "a tail that grows": (
-        lambda document: document["gains"]["model"].update(decay=-1.0), "model: not proven to decay",
+        lambda document: document["gains"]["model"].update(decay=-1.0),
+        "model: its rate of decay is not above 0",
     ),
     "a form that is not positive": (
         lambda document: document["gains"]["plant"].update(form=[[-1.0]]), "plant: not proven to decay",
@@ -173,7 +174,9 @@ REJECTED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     ),
     "inputs without coordinates": (lambda document: document["gains"].update(inputs=[[0.0]]), "inverse"),
     "inputs of another size": (lambda document: document["gains"].update(inputs=[[1.0, 0.0]]), "inputs"),
-    "an unknown output": (lambda document: document["gains"].update(outputs=["x[7]"]), "outputs"),
+    "an unknown output": (
+        lambda document: document["gains"].update(outputs=["x[7]"]), r"outputs: 'x\[7\]' is none",
+    ),
     "no table": (lambda document: document.update(gains=3), "gains"),
 }  # fmt: skip
 

@@ -90,6 +90,9 @@ def test_another_scenario_is_told_apart(
     status, text = run(capsys, monkeypatch, str(file), "--scenario", str(given))
     what = "--scenario takes what `noack check NAME --resolved` prints"
     assert (status, text) == (1, f"REJECTED the witness is of another scenario, by its network; {what}\n")
+    given.write_text("")
+    status, text = run(capsys, monkeypatch, str(file), "--scenario", str(given))
+    assert (status, text) == (1, "REJECTED --scenario: the file has no key\n")
 
 
 def test_a_description_proves_nothing(file: Path) -> None:
