@@ -75,7 +75,17 @@ from noack_check.document import read_count, read_matrix, read_number, read_rows
 from noack_check.loop import Loop, Rule
 from noack_check.model import thresholds
 from noack_check.noise import noise_of
-from noack_check.responses import Decay, Response, norm_of, responses, responses_until, upper
+from noack_check.responses import (
+    Decay,
+    EnclosedResponses,
+    Question,
+    Response,
+    enclose,
+    norm_of,
+    responses,
+    responses_until,
+    upper,
+)
 
 Form = Mapping[str, arb]
 """Σ coefficient · signal, by the signals' names; "1" is the constant 1."""
@@ -87,6 +97,8 @@ _MOST_TESTS = 1_000_000
 """Over which an integral is averaged."""
 _MOST_AGES = 12
 """Most lost events whose ages are told apart."""
+_REST = 1e-5
+"""The share of an integral of an error for ever that is left to the tail: later parts are used, too."""
 _CHORDS, _BETTER = 8, 0.999
 """Chords of √(θ² + s²) that are tried, while they are less steep by this factor."""
 
@@ -297,7 +309,6 @@ class _Responses:
         self.scaled_H = H + rate * one
         errors = {"W": loop.weight} | {f"p {j}": rows_of(self.aged, [j]) for j in range(m)}
         self._errors = errors
-        self._ever_after: tuple[str, list[dict[str, list[Response]]]] = ("", [])
         self.is_own = is_zero(self.compared.errors - loop.weight)
         self.columns = [self.inverse]
         if witness.comparison is not None and not self.is_own:
@@ -307,9 +318,13 @@ class _Responses:
         found = responses_until(self.scaled_H, recent, list(errors.values()), self.columns)
         self.recent = dict(zip(errors, found, strict=True))
         self.untested_growth = self.growth(self.untested)
-        self.ever = {}
-        if self.lost:
-            self.ever = dict(zip(errors, self._for_ever(list(errors.values())), strict=True))
+        self._ever: EnclosedResponses | None = None
+        if self.lost and not is_zero(self.scaled_H):
+            if witness.model is None:
+                raise RejectedError("gains: model: missing")
+            question = Question(self.scaled_H, witness.model, list(errors.values()), self.columns)
+            self._ever = enclose(question, _REST)
+        self.ever = self._from(arb(0)) if self.lost else {}
 
     def _driving(self) -> list[arb_mat]:
         """Return the columns through which something acts, in the order of :meth:`UnitGains.sources`."""
@@ -326,30 +341,17 @@ class _Responses:
 
     def ever_after(self, apart: arb) -> list[tuple[dict[str, list[Response]], int]]:
         """Return :attr:`ever` from 0, 1, … times a time on, each with the number of lost events."""
-        if is_zero(self.scaled_H) or not 1 < self.lost <= _MOST_AGES:
+        if self._ever is None or not 1 < self.lost <= _MOST_AGES:
             return [(self.ever, self.lost)] if self.lost else []
-        key = str(apart.fmpq())
-        if self._ever_after[0] != key:
-            aged = [(k * apart * self.scaled_H).exp() * Y for k in range(self.lost) for Y in self.columns]
-            rows = [C for name, C in self._errors.items() if name != "W"]
-            assert self.witness.model is not None
-            found, width = responses(self.scaled_H, self.witness.model, rows, aged), len(self.columns)
-            names = [name for name in self._errors if name != "W"]
-            self._ever_after = (
-                key,
-                [
-                    {name: row[width * k : width * (k + 1)] for name, row in zip(names, found, strict=True)}
-                    for k in range(self.lost)
-                ],
-            )
-        return [(each, 1) for each in self._ever_after[1]]
+        return [(self._from(k * apart), 1) for k in range(self.lost)]
 
-    def _for_ever(self, outputs: Sequence[arb_mat]) -> list[list[Response]]:
-        if is_zero(self.scaled_H):
-            return [[Response(norm_of(C * Y), arb(0)) for Y in self.columns] for C in outputs]
-        if self.witness.model is None:
-            raise RejectedError("gains: model: missing")
-        return responses(self.scaled_H, self.witness.model, outputs, self.columns)
+    def _from(self, time: arb) -> dict[str, list[Response]]:
+        """Return the growth of errors from a time on, for ever."""
+        if self._ever is not None:
+            return dict(zip(self._errors, self._ever.after(time), strict=True))
+        return {
+            name: [Response(norm_of(C * Y), arb(0)) for Y in self.columns] for name, C in self._errors.items()
+        }
 
 
 class UnitGains:
