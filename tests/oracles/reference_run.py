@@ -86,16 +86,17 @@ def _references(
 ) -> list[tuple[int, Callable[[int], Array]]]:
     """Return [x_r, u_r] by time: the segments of a reference, or the set-points in force."""
     if scenario.controller.reference is None:
-        return [(t_ns, partial(_rest, scenario_then)) for t_ns, scenario_then in in_force]
+        return [(t_ns, _at_rest(scenario_then)) for t_ns, scenario_then in in_force]
     segments = reference_of(scenario).segments
     return [(segment.begin_ns, partial(_follow, segment)) for segment in segments]
 
 
-def _rest(scenario: Scenario, t_ns: int) -> Array:
-    """Return a set-point, and the smallest input with Âx_r + B̂u_r = 0."""
+def _at_rest(scenario: Scenario) -> Callable[[int], Array]:
+    """Return a set-point, and the smallest input with Âx_r + B̂u_r = 0, at all times."""
     A, B = (np.array(matrix) for matrix in scenario.model.matrices)
     x_r = np.array(scenario.controller.setpoint or np.zeros(len(A)))
-    return np.concatenate([x_r, -np.linalg.pinv(B) @ A @ x_r])
+    both = np.concatenate([x_r, -np.linalg.pinv(B) @ A @ x_r])
+    return lambda _: both
 
 
 def _follow(segment: ReferenceSegment, t_ns: int) -> Array:
