@@ -2,7 +2,7 @@
 
 import copy
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,9 @@ from noack_check.proof import read_assumptions
 def completed(loop: Loop, document: Mapping[str, Any], signal: float = 0.0) -> dict[str, Any]:
     """Return the document with the entries that a loop's model needs and it lacks.
 
-    A location after one loss more is a copy of the one before, a form in which c is the same everywhere has
-    that of the location without losses. All else is 0: what a document does not have it claims to be nothing.
+    A location after one loss more is a copy of the one before, with 0 for what this does not have. A form
+    in which c is the same everywhere has that of the location without losses. All else is 0: what a document
+    does not have it claims to be nothing.
 
     Args:
         loop: the loop that the document shall be about.
@@ -35,11 +36,16 @@ def completed(loop: Loop, document: Mapping[str, Any], signal: float = 0.0) -> d
             for name, left, _ in item.parts:
                 size = left.nrows()
                 if np.shape(matrices.get(name)) != (size, size):
-                    matrices[name] = matrices.get(_before(name), np.zeros((size, size)).tolist())
+                    matrices[name] = _of_size(size, matrices.get(_before(name), []))
             for name, _ in item.scalars:
                 least = signal if "/signal " in name else 0.0
                 numbers.setdefault(name, numbers.get(_before(name), numbers.get(f"{name}/0 lost", least)))
     return found
+
+
+def _of_size(size: int, rows: Sequence[Sequence[float]]) -> list[list[float]]:
+    k = min(size, len(rows))
+    return np.pad(np.array(rows)[:k, :k], (0, size - k)).tolist() if k else np.zeros((size, size)).tolist()
 
 
 def _before(name: str) -> str:

@@ -19,6 +19,7 @@ from noack_check.keys import RefusedError
 from noack_check.loop import Loop
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
+from tests.checker.completed import completed
 from tests.checker.runs import floats
 from tests.helpers.shipped import resolved, shipped
 
@@ -119,8 +120,9 @@ def test_the_bound_is_none_of_another_reference(
     statement: WitnessedStatement, key: str, row: int, column: int, factor: float
 ) -> None:
     assert statement.document is not None
-    with pytest.raises(RejectedError):
-        prove(loop_with(changed(key, row, column, factor)), statement.document)
+    loop = loop_with(changed(key, row, column, factor))
+    with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
+        prove(loop, completed(loop, statement.document))
 
 
 def test_a_jump_ends_the_statement_before_it() -> None:
@@ -129,18 +131,22 @@ def test_a_jump_ends_the_statement_before_it() -> None:
 
 
 @pytest.mark.parametrize(
-    "setting",
+    ("setting", "reason"),
     [
-        "plant.uncertainty_B=[[0.0],[0.6]]",  # the mismatch about the reference is larger
-        "controller.rate_hz=50",  # an input is held for longer
-        "plant.initial_state=[0.9,0.0]",
-        'controller.reference=[{kind="sine",output="angle",amplitude=3.0,hz=0.3,from_s=1.0,join_s=2.0}]',
+        ("plant.uncertainty_B=[[0.0],[0.6]]", "flow/0 lost/"),  # the mismatch about the reference is larger
+        ("controller.rate_hz=50", "flow/0 lost/"),  # an input is held for longer
+        ("plant.initial_state=[0.9,0.0]", "start$"),
+        (
+            'controller.reference=[{kind="sine",output="angle",amplitude=3.0,hz=0.3,from_s=1.0,join_s=2.0}]',
+            "flow/0 lost/",
+        ),
     ],
 )
-def test_the_bound_is_none_of_a_worse_loop(statement: WitnessedStatement, setting: str) -> None:
+def test_the_bound_is_none_of_a_worse_loop(statement: WitnessedStatement, setting: str, reason: str) -> None:
     assert statement.document is not None
-    with pytest.raises(RejectedError):
-        prove(loop_with(servo(setting)), statement.document)
+    loop = loop_with(servo(setting))
+    with pytest.raises(RejectedError, match=f"^x: {reason}"):
+        prove(loop, completed(loop, statement.document))
 
 
 def test_an_older_input_differs_by_more() -> None:

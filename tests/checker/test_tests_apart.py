@@ -19,6 +19,7 @@ from noack_check.model import Model
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
 from noack_check.tests_apart import Place, Places
+from tests.checker.completed import completed
 from tests.checker.runs import exceeded, floats
 from tests.checker.test_mutations import DOCUMENTS
 from tests.checker.test_mutations import LOOPS as OTHER_LOOPS
@@ -193,6 +194,15 @@ CHANGES: dict[str, Callable[[Loop], Loop]] = {
 }
 
 
+REASONS = {
+    "one loss more": "flow/1 lost|edge/1 lost, dwells, lost, 2 lost",
+    "larger start": "start$",
+    "another plant": "flow/0 lost/",
+    "a disturbance": "flow/0 lost/",
+    "tests twice as far apart": "flow/0 lost/|edge/0 lost, silent",
+}
+
+
 def arb_column(n: int) -> Any:
     return matrix([[1.0]] * n)
 
@@ -201,25 +211,27 @@ def arb_column(n: int) -> Any:
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_witness_proves_nothing_about_another_loop(name: str, change: str) -> None:
     loop, witness = base(name)
-    with pytest.raises(RejectedError):
-        prove(CHANGES[change](loop), witness.document)
+    other = CHANGES[change](loop)
+    with pytest.raises(RejectedError, match=f"^(x|e_c): ({REASONS[change]})"):
+        prove(other, completed(other, witness.document))
 
 
 def test_a_longer_dwell_time_and_another_memory_are_rejected() -> None:
     loop, witness = base("dwell")
     longer = loop._replace(times=loop.times._replace(dwell=8 * T))
-    with pytest.raises(RejectedError):
-        prove(longer, witness.document)
+    with pytest.raises(RejectedError, match=r"^e_c: flow/0 lost, dwells/"):
+        prove(longer, completed(longer, witness.document))
     loop, witness = base("dynamic")
     memory = loop.rule.memory
     assert memory is not None
-    for other in (
-        memory._replace(gain=memory.gain * 2),
-        memory._replace(start=arb(9)),
-        memory._replace(decay=arb(0)),
+    for other, reason in (
+        (memory._replace(gain=memory.gain * 2), r"^x: edge/0 lost, silent"),
+        (memory._replace(start=arb(9)), r"^x: start$"),
+        (memory._replace(decay=arb(0)), r"^x: edge/0 lost, silent"),
     ):
-        with pytest.raises(RejectedError):
-            prove(loop._replace(rule=loop.rule._replace(memory=other)), witness.document)
+        changed = loop._replace(rule=loop.rule._replace(memory=other))
+        with pytest.raises(RejectedError, match=reason):
+            prove(changed, completed(changed, witness.document))
 
 
 def test_a_negative_coefficient_of_the_memory_is_rejected() -> None:
@@ -230,7 +242,7 @@ def test_a_negative_coefficient_of_the_memory_is_rejected() -> None:
     for name in numbers:
         if name.startswith("eta/"):
             numbers[name] = -abs(numbers[name])
-    with pytest.raises(RejectedError):
+    with pytest.raises(RejectedError, match=r"^x: edge/0 lost, silent"):
         prove(loop, document)
 
 
@@ -246,7 +258,7 @@ def test_the_drift_bounds_no_error_during_a_dwell_time() -> None:
     loop, witness = base("dwell")
     document: Any = copy.deepcopy(dict(witness.document))
     document["bounds"][0]["output"] = "drift"
-    with pytest.raises(RejectedError):
+    with pytest.raises(RejectedError, match=r"^drift: output/0 lost/"):
         prove(loop, document)
     with pytest.raises(RejectedError, match="errors"):
         prove(loop, {**witness.document, "errors": {"decaying": 1.0, "constant": 1.0}})

@@ -161,8 +161,8 @@ def test_at_rate_0_the_bounds_are_those_of_the_largest_threshold() -> None:
     witness = find_witness(holding())
     assert not witness.proof.rate > 0
     prove(holding(), witness.document)
-    with pytest.raises(RejectedError):
-        prove(holding(level=0.05), witness.document)
+    with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
+        prove(holding(level=0.05), completed(holding(level=0.05), witness.document))
 
 
 def relative(sigma: float) -> Loop:
@@ -179,7 +179,7 @@ def test_a_relative_rule_has_decaying_bounds(sigma: float) -> None:
     assert 1.0 <= sizes["x"] < 1.25
     assert sizes["e_s"] < 1.25 * sigma
     assert sizes["e_c"] < 6 * sigma
-    with pytest.raises(RejectedError):
+    with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
         prove(relative(1.05 * sigma), witness.document)
 
 
