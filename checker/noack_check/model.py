@@ -202,6 +202,7 @@ class Model:
         later_at_start: most events after the one at t = 0 before the first input acts.
         pieces: of the period of a periodic rule, or of the time between tests, on which P is affine.
         by_tests: V depends on where each update is at each test, which is at an exact time.
+        counted: V depends on the number of silent tests since the last event, up to so many.
         is_exact: with False a coarse approximation of K e^{−Hs} replaces its hull, for a search.
     """
 
@@ -217,10 +218,12 @@ class Model:
         later_at_start: int = 0,
         pieces: int = 1,
         by_tests: bool = False,
+        counted: int = 0,
         is_exact: bool = True,
     ) -> None:
         self.loop, self.rate, self.decay, self.errors = loop, rate, decay, errors
         self.later, self.is_exact = later, is_exact
+        self.counted = counted
         self.later_at_start = later_at_start
         self.is_periodic = loop.times.period > 0
         self._pieces, self.memory = pieces, loop.rule.memory
@@ -230,7 +233,7 @@ class Model:
         if loop.needs_tests_apart and not loop.times.sampling == loop.times.least_sampling > 0:
             raise ValueError("forms for a dwell time need tests that are a known time apart")
         if by_tests or loop.needs_tests_apart:
-            self._places = Places(loop.losses, loop.times, later, later_at_start)
+            self._places = Places(loop.losses, loop.times, later, later_at_start, counted)
         self._clock = self._clock_nodes(pieces) if self.is_periodic else []
         n, copies = loop.n, max(later, later_at_start)
         seen = loop.seen if self._places is not None else None
@@ -554,6 +557,10 @@ class Model:
         """Whether V depends on where each update is at each test."""
         return self._places is not None
 
+    def silent_tests(self, location: int) -> int:
+        """Return how many silent tests were counted since the last event."""
+        return 0 if self._places is None else self._places.places[location].silent
+
     def _locations_by_tests(self, places: Places) -> list[Location]:
         flows = self._flows(self._gains())
         no_input = self._flows([0 * self.loop.gain], self._before_input())
@@ -575,6 +582,8 @@ class Model:
         if place.ages:
             ages = (float(arb(age / self.loop.times.sampling)) for age in place.ages)
             parts.append(f"{' '.join(f'{age:g}' for age in ages)} tests ago")
+        if place.silent:
+            parts.append(f"an event {place.silent} tests ago")
         return ", ".join([*parts, "dwells"] if place.dwells else parts)
 
     def _edges_by_tests(self, places: Places) -> list[Edge]:
@@ -711,17 +720,27 @@ class Model:
         if self.memory is not None:
             squares.append(("eta", square(self.y * E)))
         parts = tuple((f"P/{name}", size.sqrt() * rows) for name, size in names)
-        return Form(
-            parts, tuple((f"{letter}/{name}", size * M) for letter, M in squares for name, size in names)
-        )
+        scalars = [(f"{letter}/{name}", size * M) for letter, M in squares for name, size in names]
+        if self.counted:  # without a threshold one c₁ is as good as others
+            scalars = [s for s in scalars if not s[0].startswith("c1")] + [("c1", -1 * square(self.f1 * E))]
+        return Form(parts, tuple(scalars))
 
     def _names_by_tests(self, location: int, node: int) -> list[tuple[str, arb]]:
-        """Return the names of P and P', with their factors; of P alone where it is first used."""
+        """Return the names of P and P', with their factors; of P alone where it is first used.
+
+        Where no update is on its way, P' is affine in the number of silent tests, between :func:`_knots`.
+        """
         place, kinds = self.locations[location], [_kind(each.name) for each in self.locations[: location + 1]]
         common = (kinds[-1], arb(1))
         if node == 0 and kinds.count(kinds[-1]) == 1:
             return [common]
-        return [common, (f"{place.name}, {node}", place.nodes[-1])]
+        if not (silent := self.silent_tests(location)) or " ago, " in place.name:
+            return [common, (f"{place.name}, {node}", place.nodes[-1])]
+        low, high = _knots(silent, self.counted)
+        share = arb(silent - low) / max(high - low, 1)
+        around = ((low, 1 - share), (high, share))
+        names = ((f"{kinds[-1]}, {knot} silent, {node}", s * place.nodes[-1]) for knot, s in around if s > 0)
+        return [common, *names]
 
     # The inequalities.
 
@@ -911,6 +930,14 @@ def _corners(K: arb_mat, H: arb_mat, q: arb, degree: int) -> tuple[list[arb_mat]
         shares = [arb(comb(i, k)) / comb(degree, k) for k in range(i + 1)]
         points.append(sum((share * term for share, term in zip(shares, terms, strict=False)), 0 * K))
     return points, rest
+
+
+def _knots(count: int, most: int) -> tuple[int, int]:
+    """Return the knots around a number of silent tests, from 1 to the most that are counted."""
+    low = high = 1
+    while high < count:
+        low, high = high, min(max(high + 1, high * 4 // 3), most)
+    return low, high
 
 
 def _kind(name: str) -> str:

@@ -34,6 +34,7 @@ from noack_check.loop import Loop, Noise, Region, Smooth, Times
 from noack_check.model import Chain, Errors, Model, thresholds
 from noack_check.noise import noise_of
 from noack_check.norms import decays_below, growth, spectral_norm
+from noack_check.tests_apart import MOST_PLACES
 
 MOST_PIECES = 64
 MOST_LATER = 8
@@ -183,11 +184,13 @@ class Assumptions(NamedTuple):
     """Of an observer."""
     by_tests: bool = False
     """V depends on where each update is at each test."""
+    counted: int = 0
+    """It depends on the number of silent tests since the last event, too, up to so many."""
 
     @property
     def of_model(self) -> dict[str, Any]:
         """Further arguments of the model."""
-        names = ("later", "later_at_start", "pieces", "by_tests")
+        names = ("later", "later_at_start", "pieces", "by_tests", "counted")
         return {name: getattr(self, name) for name in names}
 
 
@@ -213,8 +216,11 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     if (by_tests or loop.needs_tests_apart) and loop.loads:
         raise RejectedError("by_tests: not with unknown loads")
     by_tests = bool(by_tests) or loop.needs_tests_apart
+    counted = read_count(document, "counted", MOST_PLACES) if "counted" in document else 0
+    if counted and not by_tests:
+        raise RejectedError("counted: only forms of each test count tests")
     if "errors" not in document:
-        return Assumptions(None, later, at_start, chain, pieces, noise, by_tests)
+        return Assumptions(None, later, at_start, chain, pieces, noise, by_tests, counted)
     if loop.times.period > 0 or by_tests:
         raise RejectedError("errors: of no use with a periodic rule, or with forms of each test")
     table = document["errors"]

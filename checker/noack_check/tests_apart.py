@@ -4,6 +4,8 @@ With a dwell time the first test after an event comes D after it instead. Nothin
 the ages of all updates on their way are known at each test. A *place* is what is known right after one:
 how many updates are lost, or the ages of those that are on their way. In a place a clock shows the time
 since that test. A *move* leads from one place to another one.
+
+Silent tests since the last event may be counted, up to a number. So V may depend on how long x_s has rested.
 """
 
 from collections.abc import Iterator
@@ -13,7 +15,7 @@ from flint import fmpq
 
 from noack_check.loop import Times
 
-MOST_PLACES = 64
+MOST_PLACES = 160
 _CLOSE = 1000
 """Nodes of a clock are at least such a share of its length apart."""
 
@@ -32,6 +34,8 @@ class Place(NamedTuple):
     """Whether the first input has acted."""
     dwells: bool = False
     """Whether the test was an event, after which the rule does not count for a time."""
+    silent: int = 0
+    """So many tests since the last event were silent, up to those that are counted."""
 
     @property
     def later(self) -> int:
@@ -64,13 +68,15 @@ class Places:
         times: of the loop.
         later: most events within the delay after an event.
         later_at_start: most events after the one at t = 0 before the first input acts.
+        counted: most silent tests since an event that are counted.
 
     Raises:
         ValueError: there are too many.
     """
 
-    def __init__(self, losses: int, times: Times, later: int, later_at_start: int) -> None:
+    def __init__(self, losses: int, times: Times, later: int, later_at_start: int, counted: int = 0) -> None:
         self._losses, self._times, self._later, self._later_at_start = losses, times, later, later_at_start
+        self._counted = counted
         self._has_dwell = times.dwell > times.sampling
         dwells, zero = self._has_dwell, fmpq(0)
         self.start = Place(0, (zero,), False, dwells) if times.start > 0 else Place(0, (), True, dwells)
@@ -121,8 +127,9 @@ class Places:
         if limit is not None and place.ages[0] + end >= limit:
             return  # the update acts before the next test
         ages, zero = tuple(age + end for age in place.ages), fmpq(0)
-        yield Move(place, place._replace(ages=ages, dwells=False), "silent")
-        after = place._replace(ages=ages, dwells=self._has_dwell)
+        silent = min(place.silent + 1, self._counted)
+        yield Move(place, place._replace(ages=ages, dwells=False, silent=silent), "silent")
+        after = place._replace(ages=ages, dwells=self._has_dwell, silent=0)
         if limit is None:
             if place.lost < self._losses:
                 yield Move(place, after._replace(lost=place.lost + 1), "lost")

@@ -56,7 +56,15 @@ def dynamic() -> Loop:
     )
 
 
+def held() -> Loop:
+    """Return Tabuada's example under Girard's rule, with its input held, tested every 6 ms, a test late."""
+    step = fmpq(6, 1000)
+    times = Times(step, step, step, fmpq(0), step)
+    return read("tabuada_dynamic")._replace(times=times)
+
+
 LOOPS: dict[str, Callable[[], Loop]] = {
+    "held": held,
     "dwell": lambda: dwelling()._replace(losses=0),
     "dwell, a loss": dwelling,
     "dynamic": dynamic,
@@ -84,7 +92,8 @@ def test_runs_stay_below_the_bounds(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "share"), [("dwell", 0.6), ("dynamic", 0.6), ("switching", 0.97), ("grid", 0.5)]
+    ("name", "share"),
+    [("dwell", 0.6), ("dynamic", 0.6), ("switching", 0.97), ("grid", 0.5), ("held", 0.93)],
 )
 def test_runs_come_near_the_bounds(name: str, share: float) -> None:
     loop, witness = base(name)
@@ -180,6 +189,25 @@ def test_a_loop_starts_with_the_noise_of_its_measurement(gain: list[list[float]]
     assert abs(start[:, 1:]) == pytest.approx(abs(floats(form) @ z[[*model.locations[0].coordinates]]) / 2)
 
 
+def test_silent_tests_are_counted_since_the_last_event() -> None:
+    found = Places(1, Times(T, T, 2 * T, fmpq(0), fmpq(0)), 1, 1, counted=3)
+    assert {place.silent for place in found.places} == {0, 1, 2, 3}
+    for move in found.moves:
+        following = {"silent": min(move.source.silent + 1, 3), "arrival": move.source.silent}
+        assert move.target.silent == following.get(move.kind, 0)
+
+
+def test_between_knots_forms_are_affine_in_the_number_of_silent_tests() -> None:
+    model = Model(held(), arb(0), arb(1), by_tests=True, counted=16)
+    silent = [model.silent_tests(index) for index in range(len(model.locations))]
+    of_each = {count: model.form(silent.index(count), 1).parts for count in (13, 14, 16)}
+    names = {count: [name for name, _ in parts] for count, parts in of_each.items()}
+    assert names[14] == ["P/0 lost", "P/0 lost, 13 silent, 1", "P/0 lost, 16 silent, 1"]
+    assert (names[13], names[16]) == (names[14][:2], [names[14][0], names[14][2]])
+    before, after = (float(S[0, 0] ** 2) for _, S in of_each[14][1:])
+    assert (before, after) == pytest.approx((2 / 3 * 0.006, 1 / 3 * 0.006))
+
+
 # False witnesses.
 
 
@@ -252,6 +280,16 @@ def test_the_error_has_no_bound_where_the_model_has_only_its_input() -> None:
     document["bounds"][0]["output"] = "e_s"
     with pytest.raises(RejectedError, match="e_s"):
         prove(loop, document)
+
+
+def test_a_witness_counts_as_many_tests_as_it_has_forms_for() -> None:
+    loop, witness = base("held")
+    counted: Any = witness.document["counted"]
+    for other in (0, counted // 2, counted + 1, 10**6, -1):
+        with pytest.raises(RejectedError, match=r"missing|counted"):
+            prove(loop, {**witness.document, "counted": other})
+    with pytest.raises(RejectedError, match="counted"):
+        prove(double_integrator(SCHEDULE), {"rate": 0.0, "counted": 4, "bounds": []})
 
 
 def test_the_drift_bounds_no_error_during_a_dwell_time() -> None:

@@ -43,6 +43,12 @@ def simulated_frames(model: Model) -> Frames:
             for name, S in model.form(index, node).parts:
                 where = [place.coordinates[int(np.flatnonzero(row)[0])] for row in floats(S)]
                 block = (runs.moments("") if name.startswith("X") else own)[np.ix_(where, where)]
+                if model.counted:  # e_s is small after an event, so in units of what each entry is then
+                    then = runs.moments_after(max(model.silent_tests(index), 1))[np.ix_(where, where)]
+                    if (sizes := np.sqrt(np.diag(then))).all():
+                        correlation = then / np.outer(sizes, sizes) + 0.3 * np.eye(len(sizes))
+                        frames[name] = 2 * sizes[:, None] * _root(correlation)
+                        continue
                 frames[name] = 2 * _root(block + 0.3 * np.diag(np.diag(block)))
     if model.memory is not None:
         frames[MEMORY] = 2 * np.sqrt(runs.moments("")[np.ix_(runs.memory, runs.memory)])
@@ -110,6 +116,8 @@ class _Runs:
         self._later, self._most = np.zeros(_RUNS, int), model.later
         self._waiting = np.zeros(_RUNS, bool)
         self._loss_rate = self._rng.choice(_LOSS_RATES, _RUNS)
+        self._silent_sums = np.zeros((model.counted + 1, N, N))
+        self._silent_counts = np.zeros(model.counted + 1)
         self._sums: dict[str, Matrix] = defaultdict(lambda: np.zeros((N, N)))
         self._counts: dict[str, int] = defaultdict(int)
 
@@ -141,6 +149,10 @@ class _Runs:
         if location not in self._sums:
             return np.asarray(total)
         return np.asarray(0.7 * self._sums[location] / self._counts[location] + 0.3 * total)
+
+    def moments_after(self, silent: int) -> Matrix:
+        """Return the second moments of all locations after some silent tests since an event."""
+        return np.asarray(self._silent_sums[silent] / max(self._silent_counts[silent], 1))
 
     def _flow(self, step: int) -> None:
         moved = np.empty_like(self._z)
@@ -196,6 +208,10 @@ class _Runs:
         unit = float(self._unit.sum()) or 1.0
         ratio = np.maximum(size / unit if size.any() else decay, 1e-300)
         scaled = self._z / np.sqrt(ratio)[:, None]
+        if (most := len(self._silent_counts) - 1) > 0:
+            silent = np.minimum(np.rint(self._since_event / self._h).astype(int), most)
+            np.add.at(self._silent_sums, silent, scaled[:, :, None] * scaled[:, None, :])
+            np.add.at(self._silent_counts, silent, 1)
         for lost in range(self._loop.losses + 1):
             self._add(f"{lost} lost", scaled[(self._missing == lost) & ~self._waiting])
         for later in range(self._most + 1):

@@ -44,6 +44,8 @@ _ATTEMPTS_BY_TESTS = (
     _ATTEMPTS[0],
 )
 """Those of forms of each test, in which V changes little from test to test."""
+_ATTEMPT_COUNTED = 1e-7, Accuracy(gap=1e-2, feasibility=1e-8, improves_steps=True)
+"""That of forms which count silent tests."""
 _COARSE_MARGIN = 1e-6
 _FIRST_SHARE, _FIRST_SLOW_SHARE, _SMALLEST_SHARE = 0.42, 0.04, 0.02
 """ν is between 2r and twice the loop's rate of decay, at a share."""
@@ -54,6 +56,8 @@ _MOST_TRIES, _FEW_TRIES, _LARGE = 5, 2, 1.0
 _ROOM, _NEAR = 1 + 1e-6, 1.04
 _PIECES, _PIECES_OF_TESTS = (4, 16), (1, 4, 32)
 """Of the period of a periodic rule, or of the time between two tests, until there is a witness."""
+_COUNTED = 32, 128
+"""Silent tests that are counted since an event, until there is a witness."""
 _MOST_LOSSES = 24
 _MOST_GUESSES = 6
 _EXPECTED = 5
@@ -239,18 +243,22 @@ def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort, tried: Sequence[int] 
     by_tests = not loop.times.period > 0
     if loop.rule.memory is not None and loop.losses:
         raise NoWitnessError("with losses quadratic forms are not known for a rule with a dynamic variable")
-    if loop.rule.memory is not None and loop.holds:  # x_s rests, and where xᵀPB = 0 K e_s may have any size
-        raise NoWitnessError("trigger.policy: a dynamic rule bounds no held input; one with a deadline does")
     fastest = min((each["rate"] for each in wanted.near if isinstance(each["rate"], float)), default=math.inf)
     last: tuple[_OutputSearch, str] | None = None
-    for pieces in tried or (_PIECES_OF_TESTS if by_tests else _PIECES):
-        for rates in (_Rates(loop, slow=share, by_tests=by_tests) for share in (0.3, 0.02)):
+    pairs = [(pieces, 0) for pieces in tried or (_PIECES_OF_TESTS if by_tests else _PIECES)]
+    shares: tuple[float, ...] = (0.3, 0.02)
+    if loop.rule.memory is not None and loop.holds:  # one test bounds no K e_s, the time since the event does
+        pairs, shares = [(1, counted) for counted in _COUNTED], (0.3, 0.1, 0.02)
+    for pieces, counted in pairs:
+        for rates in (_Rates(loop, slow=share, by_tests=by_tests) for share in shares):
             if rates.rate > fastest:
                 continue
             rates.first_share, rates.moves = _SMALLEST_SHARE, (0,)
             document = {**first_assumptions(loop, rates.rate), "pieces": pieces}
             if by_tests:
                 document["by_tests"] = True
+            if counted:
+                document["counted"] = counted
             effort.expect(_EXPECTED)
             search = _OutputSearch(loop, rates, document, rates.shares(wanted.near), effort)
             has_errors = not by_tests or loop.seen is None
@@ -496,6 +504,8 @@ class _OutputSearch:
         found: dict[float, Found] = {}
         is_direct, known = self._is_direct(output, starts=starts), self._known.get((output, starts))
         margin, accuracy = _ATTEMPTS[0] if is_direct else (_COARSE_MARGIN, _COARSE)
+        if self._assumed.counted:
+            margin, accuracy = _ATTEMPT_COUNTED
 
         def size(share: float) -> float:
             decay = self._rates.decay(share)
