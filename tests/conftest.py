@@ -9,7 +9,7 @@ import gc
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,8 +34,9 @@ FIRST = (
     "tests/native/test_sanitized.py", "tests/checker/test_random_loops.py", "tests/test_doc_programs.py",
     "tests/checker/test_mutations.py", "tests/checker/test_periodic_rules.py",
     "tests/integration/", "tests/native/", "tests/cosim/simulation/test_whole_loop.py", "tests/test_docs.py",
-    "tests/attacks/", "tests/cosim/",
-    "tests/netem/", "tests/noack/plants/", "tests/noack/theory/",
+    "tests/attacks/", "tests/test_portable.py", "tests/checker/", "tests/cosim/", "tests/fuzz/",
+    "tests/oracles/",
+    "tests/netem/", "tests/noack/plants/", "tests/noack/theory/", "tests/noack/traces/",
 )  # fmt: skip
 """What takes longest, in this order: a worker runs whole files, and none should end alone."""
 
@@ -161,6 +162,26 @@ def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
         return prove(self, **(named | {"most_work": 0.02}))
 
     monkeypatch.setattr(Certificates, "prove", shortly)
+
+
+@pytest.fixture
+def no_searches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a search find what needs none, where it does not matter what is proven.
+
+    Even the shortest search takes some seconds. What is found is kept apart from what others find.
+    """
+    from noack.theory.witnesses.documents import witness_by_gains
+    from noack.theory.witnesses.regions import region_witness_by_gains
+
+    monkeypatch.setenv("XDG_CACHE_HOME", f"{os.environ['XDG_CACHE_HOME']} without searches")
+    for name, by_gains in (("", witness_by_gains), ("region_", region_witness_by_gains)):
+
+        def find(
+            of: Any, outputs: Sequence[str], *, ultimate: Sequence[str], by_gains: Any = by_gains, **_: object
+        ) -> object:
+            return by_gains(of, (*outputs, "e_s", *ultimate))
+
+        monkeypatch.setattr(f"cosim.analysis.witnesses.find_{name}witness", find)
 
 
 @pytest.fixture

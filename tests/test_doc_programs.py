@@ -59,7 +59,7 @@ def shorter(words: list[str]) -> list[str]:
     return [*words, *more]
 
 
-@pytest.mark.usefixtures("without_viewer", "no_drawing", "short_searches")
+@pytest.mark.usefixtures("without_viewer", "no_drawing", "no_searches")
 @pytest.mark.parametrize("command", sorted(set(commands())))
 def test_every_command_works(command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program, *words = shlex.split(command.partition(" > ")[0])
@@ -83,7 +83,7 @@ def snippets() -> list[str]:
     return [snippet for snippet in programs if not snippet.startswith("#")]
 
 
-@pytest.mark.usefixtures("without_viewer", "short_searches")
+@pytest.mark.usefixtures("without_viewer", "no_searches")
 @pytest.mark.parametrize("snippet", snippets())
 def test_every_snippet_runs(
     snippet: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch,
@@ -94,7 +94,7 @@ def test_every_snippet_runs(
     assert capsys.readouterr().out.strip()
 
 
-@pytest.mark.usefixtures("short_searches")
+@pytest.mark.usefixtures("no_searches")
 @pytest.mark.parametrize("name", FIGURES)
 def test_an_example_runs_and_leaves_its_figures(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]

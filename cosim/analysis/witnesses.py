@@ -350,7 +350,7 @@ def _known_or_found(
 
 _found_by_gains = dict[tuple[str, tuple[str, ...]], Witness | str]()
 """What was found without a search in this process, or why nothing was."""
-_MOST_KEPT = 64
+_MOST_KEPT = 300
 
 
 def _by_gains(store: WitnessStore, wanted: tuple[str, ...], search: Callable[[], Witness]) -> Witness:

@@ -72,7 +72,7 @@ def test_a_written_model_has_the_parameters_and_delays(tmp_path: Path) -> None:
     assert correlations[0] == pytest.approx(correlations[1], abs=0.03)
 
 
-@pytest.mark.usefixtures("short_searches")
+@pytest.mark.usefixtures("no_searches")
 def test_a_scenario_takes_the_network_of_a_file(tmp_path: Path) -> None:
     """The trace is beside that file, whatever the folder of the scenario is."""
     (folder := tmp_path / "measured").mkdir()

@@ -8,7 +8,7 @@ import pytest
 from noack.core.errors import ExitStatus
 from tests.helpers.command_line import invoke
 
-pytestmark = pytest.mark.usefixtures("short_searches")
+pytestmark = pytest.mark.usefixtures("no_searches")
 
 SCENARIO = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
 

@@ -72,7 +72,7 @@ def test_any_document_becomes_structures_of_a_mat_file(tmp_path: Path) -> None:
     assert max(map(len, stored)) <= 31
 
 
-@pytest.mark.usefixtures("short_searches")
+@pytest.mark.usefixtures("no_searches")
 def test_files_of_several_loops_have_the_loops_names(loops: noack.Run, tmp_path: Path) -> None:
     name, loop = list(loops.loops.items())[-1]
     steps = loop.table("plant_step")["now_ns"].to_pylist()
