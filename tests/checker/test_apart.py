@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from flint import arb, fmpq
-from scipy.linalg import expm
 
 from noack.theory.witnesses.documents import witness_by_gains
 from noack_check.apart import _sum_of_vectors, reached, share_of_threshold
@@ -17,13 +16,12 @@ from noack_check.check import RejectedError
 from noack_check.gains import Gains
 from noack_check.loop import Loop, Times
 from noack_check.proof import Proof, prove
-from tests.checker.runs import floats
+from tests.checker.shortest import shortest_times
 from tests.checker.test_gains import changed, scalar
 from tests.checker.test_witnesses import IDEAL, SCHEDULE
 
 _NEAR = 0.97
 """The share of the least time of a run that is proven, at least."""
-_STEP_S = 5e-4
 NOISE = number(0.05) * identity(1)
 
 
@@ -46,37 +44,9 @@ def proven(loop: Loop) -> tuple[dict[str, Any], Proof]:
     return dict(witness.document), witness.proof
 
 
-def least_time(loop: Loop, until_s: float = 40.0) -> float:
-    """Return the least time between events of a run in which all pushes e_s up, after the threshold is 1.
-
-    As many updates as may be are lost, one after the other; the others act as late as they may. Each
-    measurement has the noise that brings the next event nearer.
-    """
-    H, gain, delay = float(floats(loop.H)[0, 0]), -2 * float(loop.gain[0, 0]), float(loop.times.delay)
-    level, push = float(loop.rule.level), float(loop.sizes[0])
-    noise = float(loop.noise[0, 0]) if loop.noise.ncols() else 0.0
-    F = np.array([[H + gain, gain, push], [0.0, H, 0.0], [0.0, 0.0, 0.0]])
-    step, decay = expm(F * _STEP_S), math.exp(H * _STEP_S)
-    e, lost, events = noise, 0, [-math.inf]
-    missing: list[list[float]] = []
-    """Of each event since the last one that acts: when its update acts, and its part of w."""
-    found = [math.inf]
-    for t in np.arange(0.0, until_s, _STEP_S).tolist():
-        acting = [k for k, (acts, _) in enumerate(missing) if acts <= t]
-        if acting:
-            del missing[: acting[-1] + 1]
-        w = sum(part for _, part in missing)
-        e = float((step @ [e, w, 1.0])[0])
-        missing = [[acts, decay * part] for acts, part in missing]
-        if e + noise > max(level * math.exp(-0.005 * t), 1.0):
-            is_lost = lost < loop.losses
-            lost = lost + 1 if is_lost else 0
-            missing.append([math.inf if is_lost else t + delay, e - noise])
-            if level * math.exp(-0.005 * t) < 1:
-                found.append(t - events[-1])
-            events.append(t)
-            e = noise
-    return min(found)
+def least_time(loop: Loop) -> float:
+    """Return the least time between two events of a run, but for those of the one at t = 0."""
+    return shortest_times(loop).any
 
 
 @pytest.mark.parametrize(
