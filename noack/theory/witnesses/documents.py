@@ -527,7 +527,7 @@ class _OutputSearch:
             most = 1 if self._share else _FEW_TRIES
         first, upwards = self._share or self._rates.first_share, not self._share
         search_lowest(size, first, most, upwards=upwards, moves=self._rates.moves)
-        if not found and first == _FIRST_SHARE:
+        if not found and first == _FIRST_SHARE and compares_error(self._loop):  # others have a smaller r
             search_lowest(size, _SMALL_SHARE, most, upwards=True, moves=(0, -2))
         return found
 
