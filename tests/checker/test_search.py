@@ -214,5 +214,5 @@ def test_steps_are_improved_where_rounding_errors_end_the_solver(monkeypatch: py
 def test_with_many_events_while_an_update_is_on_its_way_there_is_no_witness() -> None:
     loop = double_integrator()
     slow = loop._replace(times=loop.times._replace(delay=fmpq(1)), half_B=matrix([[0.0], [0.9]]))
-    with pytest.raises(NoWitnessError, match="forms .+; gains: what losses and delays add"):
+    with pytest.raises(NoWitnessError, match=r"forms .+; gains: what losses and delays add"):
         find_witness(slow)
