@@ -388,8 +388,8 @@ def theorem_1(H: Matrix, alpha_per_s: float, longest_s: Sequence[float]) -> floa
 
 def _largest_at(H: Matrix, until_s: float) -> float:
     """Return the largest ‖e^{Ht}‖ at times from 0 to ``until_s``."""
-    step, reached, largest = exponential(until_s / _THEOREM_1_CELLS * H), np.eye(len(H)), 1.0
-    for _ in range(_THEOREM_1_CELLS):
-        reached = step @ reached
-        largest = max(largest, float(np.linalg.norm(reached, 2)))
-    return largest
+    step = exponential(until_s / _THEOREM_1_CELLS * H)
+    reached = [step]
+    for _ in range(_THEOREM_1_CELLS - 1):
+        reached.append(step @ reached[-1])
+    return max(1.0, float(np.linalg.norm(np.stack(reached), 2, axis=(1, 2)).max()))
