@@ -109,12 +109,16 @@ ifneq (,$(filter test,$(MAKECMDGOALS)))
 MAKEFLAGS += --jobs=2 # what is checked does not wait for what is tested
 endif
 # What failed is remembered apart: with --last-failed, tests of another folder would all run again.
+EXTENSION_WORKERS ?= 3
 OF_EXTENSIONS := extensions --override-ini=cache_dir=.pytest_cache/extensions
-# The checks run beside the tests, which leave the processors idle at times; their lines come last.
+# Beside the tests, which leave the processors idle at times, the checks run, and the extensions' tests in
+# one process; their lines come last.
 test: setup-dev ## Lint, types, import rules, and tests (ARGS are pytest's, e.g. ARGS="-k mansd")
-	@$(MAKE) --no-print-directory check >$(VENV)/.checks.txt 2>&1 & checks=$$!; \
+	@trap 'kill 0' INT; $(MAKE) --no-print-directory check >$(VENV)/.checks.txt 2>&1 & checks=$$!; \
+	$(if $(ARGS),,EXTENSION_WORKERS=1 $(MAKE) --no-print-directory pytest-extensions \
+		>$(VENV)/.extensions.txt 2>&1 & extensions=$$!;) \
 	$(MAKE) --no-print-directory pytest; tested=$$?; \
-	$(if $(ARGS),,$(MAKE) --no-print-directory pytest-extensions || tested=$$?;) \
+	$(if $(ARGS),,wait $$extensions || tested=$$?; cat $(VENV)/.extensions.txt;) \
 	wait $$checks; checked=$$?; cat $(VENV)/.checks.txt; exit $$((tested || checked))
 
 test-system: setup-dev ## Test what needs a browser, root or a system package, and other builds
@@ -127,7 +131,7 @@ pytest: setup-dev
 
 pytest-extensions: setup-dev
 	$(BIN)/python -m pytest $(OF_EXTENSIONS) \
-		$(or $(ARGS),-m "not system" --numprocesses=3 --dist=loadfile --no-loadscope-reorder)
+		$(or $(ARGS),-m "not system" --numprocesses=$(EXTENSION_WORKERS) --dist=loadfile --no-loadscope-reorder)
 
 # With ARGS only the parsers, with N or MINUTES only whole scenarios.
 fuzz: setup-dev ## New inputs for every parser, and random whole scenarios: N=2000 of them, or for MINUTES=60
