@@ -115,7 +115,8 @@ def witnesses_are_found_once(tmp_path_factory: pytest.TempPathFactory) -> Iterat
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
         # A search takes seconds: the claims of a run are about bounds that need none.
-        patch.setattr("cosim.analysis.claims.run_certificates.search_limit", lambda loops: 0.0)
+        for module in ("cosim.analysis.claims.run_certificates", "cosim.live.finalize"):
+            patch.setattr(f"{module}.search_limit", lambda loops: 0.0)
         yield
 
 
