@@ -135,11 +135,13 @@ def test_a_flipped_bit_in_a_footer_does_not_end_the_process(tmp_path: Path) -> N
 def _read_with_flipped_bits(path: Path, dtype: np.dtype[np.void]) -> None:
     content = path.read_bytes()
     footer_bytes = int.from_bytes(content[-8:-4], "little") + 8
-    for position in range(len(content) - footer_bytes, len(content)):
-        for bit in range(8):
-            path.write_bytes(flipped(content, 8 * position + bit))
-            with suppress(CallerError):
-                _ = [*TableFile(path, dtype).batches()]
+    with path.open("r+b", buffering=0) as file:  # in place: a file that is cut and written again is flushed
+        for position in range(len(content) - footer_bytes, len(content)):
+            for byte in (*(content[position] ^ 1 << bit for bit in range(8)), content[position]):
+                file.seek(position)
+                file.write(bytes([byte]))
+                with suppress(CallerError):
+                    _ = [*TableFile(path, dtype).batches()]
 
 
 # --- latest, and names ----------------------------------------------------------------------------
