@@ -33,7 +33,7 @@ def claims_of(record: RunRecord) -> dict[str, Claim]:
 
 def test_the_claims_of_a_run_name_the_proven_bounds(record: RunRecord) -> None:
     claims = claims_of(record)
-    bounds = find_statement(record.scenario, "own", "schedule").bounds
+    bounds = find_statement(record.scenario, "own", "schedule", most_work=RUN_WORK).bounds
     assert bounds is not None
     x = bounds.bounds["x"]
     state = claims["the state is bounded"]
@@ -103,7 +103,7 @@ def test_outputs_are_claimed_with_their_bounds_and_allowed_errors() -> None:
     """From ln(D₁/(a − D₂))/r on D₁e^(−rt) + D₂ is at most a."""
     outputs = 'outputs=[{name="position", unit="m", allowed=0.05, row=[1.0, 0.0]}]'
     run = simulate(resolved("double_integrator", "horizon_s=20", outputs))
-    bounds = find_statement(run.scenario, "own", "schedule").bounds
+    bounds = find_statement(run.scenario, "own", "schedule", most_work=RUN_WORK).bounds
     assert bounds is not None
     decaying, constant = bounds.bounds["y[0]"]
     settles_s = math.log(decaying / (0.05 - constant)) / bounds.rate_per_s
