@@ -96,8 +96,9 @@ def conclude(
     Raises:
         RejectedError: they do not prove what it assumes, or a time that it states.
     """
-    rate, bounds = read_number(document, "rate"), list(of_forms)
-    proven = {bound.output: bound for bound in bounds if bound.from_start}
+    rate = read_number(document, "rate")
+    bounds = [_joined(bound) for bound in of_forms] if rate == 0 else list(of_forms)
+    proven = {bound.output: bound for bound in of_forms if bound.from_start}
     apart = first = None
     if "drift" in proven:
         apart, first = _times_between_events(loop, rate, proven["drift"], assumed, document)
@@ -134,6 +135,11 @@ def conclude(
         raise RejectedError("u: about a reference, or where the loop rests, the input is not an output")
     apart, first = (_at_tests(loop.times, time) for time in (apart, first))
     return Proof(rate, tuple(_about(loop, bound) for bound in bounds), apart, first, is_quiet)
+
+
+def _joined(bound: Bound) -> Bound:
+    """Return a bound by forms whose units do not decay: f₁ = f₂ = 1, and |Cz|² ≤ D₁² + D₂²."""
+    return bound._replace(decaying=arb(0), constant=(bound.decaying**2 + bound.constant**2).sqrt())
 
 
 def _about(loop: Loop, bound: Bound) -> Bound:

@@ -678,10 +678,7 @@ def _compared(trigger: Table, weight: arb_mat, model: Table) -> Rule:
         states = beside(number(_real(trigger, "trigger.sigma")) * weight, zeros(n, n))
         return rule._replace(negative=states, floor=floor)
     if policy == "quadratic":
-        Q = _matrix(trigger, "trigger.Q")
-        if len(Q) != 2 * n or len(Q[0]) != 2 * n:
-            raise RefusedError(f"trigger.Q: not {2 * n} x {2 * n}")
-        positive, negative = _squares(matrix(Q))
+        positive, negative = _squares(_symmetric(trigger, "trigger.Q", 2 * n))
         floor = number(_real(trigger, "trigger.epsilon")).sqrt()
         return rule._replace(positive=positive, negative=negative, floor=floor)
     if policy == "dynamic":
@@ -698,9 +695,7 @@ def _dynamic(trigger: Table, n: int, model: Table) -> Rule:
     P is that of the model's closed loop F: FᵀP + PF = −Q.
     """
     A, B, K = (matrix(_matrix(model, f"model.{key}")) for key in ("A", "B", "gain"))
-    Q = matrix(_matrix(trigger, "trigger.Q")) if "Q" in trigger else identity(n)
-    if (Q.nrows(), Q.ncols()) != (n, n):
-        raise RefusedError(f"trigger.Q: not {n} x {n}")
+    Q = _symmetric(trigger, "trigger.Q", n) if "Q" in trigger else identity(n)
     if (P := lyapunov_function(A + B * K, Q)) is None:
         raise RefusedError("trigger.policy: the closed loop of the model is not stable")
     keys = ("sigma", "theta_s", "decay_per_s", "eta_0")
@@ -717,9 +712,9 @@ def _blocks(first: arb_mat, cross: arb_mat) -> arb_mat:
 
 
 def _squares(Q: arb_mat) -> tuple[arb_mat, arb_mat]:
-    """Return P and N with ‖Pz‖² − ‖Nz‖² = zᵀQz of a Q without radii: 2ab is ((a + b)² − (a − b)²)/2.
+    """Return P and N with ‖Pz‖² − ‖Nz‖² = zᵀQz of a symmetric Q without radii.
 
-    noack reads the lower triangle of Q.
+    2ab is ((a + b)² − (a − b)²)/2.
     """
     size = Q.nrows()
     P, N = [zeros(0, size)], [zeros(0, size)]
@@ -920,6 +915,16 @@ def _row(table: Table, name: str) -> Sequence[float]:
     if not isinstance(value, list) or not value:
         raise RefusedError(f"{name}: not a list of numbers")
     return [_checked(entry, name) for entry in value]
+
+
+def _symmetric(table: Table, name: str, size: int) -> arb_mat:
+    """Return a symmetric matrix, to the last bit: noack reads one of its triangles."""
+    M = matrix(_matrix(table, name))
+    if (M.nrows(), M.ncols()) != (size, size):
+        raise RefusedError(f"{name}: not {size} x {size}")
+    if transpose(M) != M:
+        raise RefusedError(f"{name}: not symmetric, to the last bit")
+    return M
 
 
 def _matrix(table: Table, name: str) -> Rows:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
+from math import isfinite
 
 from flint import arb, fmpq
 
@@ -145,7 +146,7 @@ def smallest_bounds(proof: Proof) -> list[Bound]:
     smallest: dict[tuple[str, bool], Bound] = {}
     for bound in proof.bounds:
         key = (bound.output, bound.from_start)
-        if key not in smallest or size(bound, proof.rate) < size(smallest[key], proof.rate):
+        if key not in smallest or size(bound) < size(smallest[key]):
             smallest[key] = bound
     return [
         bound
@@ -158,9 +159,9 @@ def _limit_is_implied(limit: Bound, bound: Bound | None, rate: arb) -> bool:
     return bound is not None and bool(rate > 0 and bound.constant <= limit.constant)
 
 
-def size(bound: Bound, rate: arb) -> float:
+def size(bound: Bound) -> float:
     """Return the bound at t = 0, as it is printed, or what is left of one in the limit."""
-    if not bound.from_start and rate > 0:
+    if not bound.from_start:
         return float(bound.constant.mid())
     return float((bound.decaying + bound.constant).mid())
 
@@ -168,8 +169,7 @@ def size(bound: Bound, rate: arb) -> float:
 def formula(bound: Bound, rate: arb) -> str:
     """Return D₁ e^{−rt} + D₂ in decimals, or what is left of it in the limit, by quadratic forms."""
     if not bound.from_start:
-        last = bound.constant if rate > 0 else (bound.decaying**2 + bound.constant**2).sqrt()
-        return f"{at_most(last)} in the limit"
+        return f"{at_most(bound.constant)} in the limit"
     decay = f" e^(−{at_least(rate)} t)" if rate > 0 else ""
     sizes = ((bound.decaying, decay), (bound.constant, ""))
     parts = [f"{at_most(value)}{end}" for value, end in sizes if not _is_zero(value)]
@@ -195,8 +195,9 @@ def _is_zero(value: arb) -> bool:
 
 def _rounded(value: arb | fmpq, rounding: str) -> str:
     exact, text = value if isinstance(value, fmpq) else value.mid().fmpq(), repr(float(value))
-    is_short = arb(float(value)).fmpq() == exact or Fraction(text) == Fraction(int(exact.p), int(exact.q))
-    if is_short and len(text) <= _SHORT:
-        return text  # which stands for exactly this number
+    if len(text) <= _SHORT and isfinite(float(value)):
+        is_exact = arb(float(value)).fmpq() == exact or Fraction(text) == Fraction(int(exact.p), int(exact.q))
+        if is_exact:
+            return text
     context = Context(prec=4, rounding=rounding)
     return f"{context.divide(Decimal(int(exact.p)), Decimal(int(exact.q))):g}"

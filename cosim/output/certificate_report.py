@@ -65,7 +65,9 @@ def _all_tables(results: Certificates) -> Iterator[Block]:
         yield _prose(f"the box has one{_listed('', [box])}")
     yield from _regions(results)
     yield from _about_rest(results)
-    if largest := _listed("the guarantee is kept", results.largest_settings):
+    if largest := _listed(
+        "this plant still has a certificate, with larger bounds,", results.largest_settings
+    ):
         yield _prose(largest)
     if (outside := outside_box(results.scenario)) is not None:
         yield _doubt("the box certificates do not cover this plant:", outside)
@@ -91,6 +93,8 @@ def _few_lines(results: Certificates) -> Iterator[Sentence]:
             yield _prose(f"{bound.formula} (proved)")
         if results.scenario.outputs:  # else the first sentence has it
             yield _prose(f"{certificate.formula(state_norm(results), 'x')} (proved)")
+        if (box := results.schedule_box) is not None and not box.exists:
+            yield _doubt("these are of this plant alone:", "nothing is proven for the stated uncertainty")
         yield from _about_rest(results)
         apart_s = certificate.inter_event_s
         if apart_s is not None and apart_s < MOST_S:
@@ -143,11 +147,11 @@ def _advice(results: Certificates) -> Sentence:
     """Return that there is no certificate, and settings with which there is one."""
     parts = [f"so no bound of ‖x‖{', though the loop is stable' if _is_stable(results) else ''}"]
     if not results.is_searched:
-        parts.append("a search, noack certify without --no-search, may find one")
+        parts.append("a search, noack certify without --no-search, may find one if none has failed yet")
     if settings := _listed("there is one", results.helpful_settings):
         parts.append(settings)
     if _is_searched_for_losses(results.scenario):
-        parts.append("noack adversary shows what losses can do to it")
+        parts.append("noack adversary shows what losses can do to this loop")
     return _doubt("no certificate for the schedule,", "; ".join(parts))
 
 

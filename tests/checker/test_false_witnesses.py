@@ -45,6 +45,7 @@ from noack_check.proof import (
     Bound,
     Proof,
     _at_first_input,
+    _joined,
     _prove_quiet_start,
     error_without_input,
     prove,
@@ -270,10 +271,12 @@ def test_the_controller_has_an_error_from_the_first_input_on() -> None:
     assert list(sentences(proof._replace(is_quiet=True))) == ["‖W e_c‖ ≤ 1.0"]
 
 
-def test_what_does_not_decay_counts_in_the_limit() -> None:
-    bound = Bound("x", arb(3), arb(4), False)
-    assert formula(bound, arb(0)) == "5.0 in the limit"
-    assert formula(bound, arb(1)) == "4.0 in the limit"
+def test_two_units_that_do_not_decay_are_joined() -> None:
+    """|Cz|² ≤ D₁² + D₂², which is less than (D₁ + D₂)²."""
+    bound = Bound("x", arb(3), arb(4), True)
+    assert formula(_joined(bound), arb(0)) == "5.0"
+    assert formula(_joined(bound._replace(from_start=False)), arb(0)) == "5.0 in the limit"
+    assert formula(bound._replace(from_start=False), arb(1)) == "4.0 in the limit"
 
 
 # Conditions without which the statements would be false.

@@ -1,13 +1,15 @@
 """The checker reads a resolved scenario as noack does."""
 
+import copy
 import random
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb_mat, fmpq
+from flint import arb, arb_mat, fmpq
 
+from cosim.analysis.witnesses import resolved_content
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import loop_of, rule_of
@@ -17,7 +19,9 @@ from noack.theory.certificates.conditions import about_reference, allowed_condit
 from noack_check.keys import RefusedError, key_table, refusals
 from noack_check.loop import Loop
 from noack_check.scenario import output_names, read_loop
+from noack_check.sentences import at_least, at_most
 from tests.helpers.resolved_tables import first_loop, resolved_tables, tables_of
+from tests.helpers.shipped import resolved
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 LOADED = {"dc_motor_load", "lane_crosswind_load"}
@@ -421,3 +425,22 @@ def test_the_outputs_of_a_scenario_are_rows_with_names() -> None:
     tables["outputs"][0]["row"] = [0.5]
     with pytest.raises(RefusedError, match=r"outputs\.row: not 2 numbers"):
         read_loop(tables, box=False, ideal=False)
+
+
+@pytest.mark.parametrize("name", ["reactor_petc", "tabuada_dynamic"])
+@pytest.mark.parametrize("change", [1.0, 1e-9])
+def test_a_trigger_whose_matrix_is_not_symmetric_is_refused(name: str, change: float) -> None:
+    """noack reads one of its triangles: the checker must not take another rule for that of the file."""
+    content = dict(resolved_content(resolved(name)))
+    trigger = copy.deepcopy(content["trigger"])
+    n = len(content["model"]["A"])
+    Q = trigger.setdefault("Q", np.eye(n).tolist())
+    read_loop(content | {"trigger": trigger}, box=False, ideal=False)
+    Q[0][1] += change
+    with pytest.raises(RefusedError, match=r"^trigger\.Q: not symmetric"):
+        read_loop(content | {"trigger": trigger}, box=False, ideal=False)
+
+
+def test_a_number_beyond_those_of_floats_is_printed() -> None:
+    assert at_most(arb("1.3e400")) == "1.301e+400"
+    assert at_least(arb("1.3e400")) == "1.299e+400"

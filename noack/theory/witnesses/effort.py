@@ -21,7 +21,7 @@ class WorkLimitError(NoWitnessError):
 def too_large(work: float) -> WorkLimitError:
     """Return that a problem needs, or its first inequalities alone need, so many 10⁹ products per step."""
     return WorkLimitError(
-        f"the loop's inequalities are too large for the search ({work:.2g} · 10⁹ products a step or more, "
+        f"the loop's inequalities are too large for the search ({work:.3g} · 10⁹ products a step or more, "
         f"at most {MOST_PER_PROBLEM:g} · 10⁹)"
     )
 

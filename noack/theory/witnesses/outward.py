@@ -34,10 +34,7 @@ def proven_bounds(proof: Proof, loop: Loop) -> ProvenBounds:
             decaying, constant = bound.decaying + added[0], bound.constant + added[1]
             bounds[bound.output] = ProvenBound(above(decaying), above(constant))
         else:
-            last = bound.constant
-            if not proof.rate > 0:
-                last = (bound.decaying**2 + bound.constant**2).sqrt()
-            limits[bound.output] = above(last)
+            limits[bound.output] = above(bound.constant)
     if loop.observer is not None or loop.noise.ncols():
         bounds["estimate"] = ProvenBound(*map(above, noise))
     if not loop.outputs.nrows():  # they are the states

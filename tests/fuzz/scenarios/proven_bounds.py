@@ -41,9 +41,9 @@ def sizes_of(record: RunRecord, rest: Vector) -> Iterator[tuple[str, Vector, Vec
     measured = measured[np.isin(measured["t_ns"], steps["t_ns"])]
     error = measured["x_s"] - steps["x"][np.searchsorted(steps["t_ns"], measured["t_ns"])]
     yield "e_s", measured["t_ns"] / NS_PER_S, np.linalg.norm(error @ W.T, axis=1)
-    delivered = record[CONTROLLER_DELIVERY]["model_t_ns"]
+    delivered = record[CONTROLLER_DELIVERY]["now_ns"]
     if record.scenario.network.initial_sync != "known_state":  # before, x_c is not known
-        ticks = ticks[ticks["model_t_ns"] >= (delivered[0] if len(delivered) else np.inf)]
+        ticks = ticks[ticks["now_ns"] > (delivered[0] if len(delivered) else np.inf)]
     newest = np.searchsorted(ticks["model_t_ns"], steps["t_ns"], side="right") - 1
     t_s, x, ticks = t_s[newest >= 0], x[newest >= 0], ticks[newest[newest >= 0]]
     ages_s = t_s - ticks["model_t_ns"] / NS_PER_S  # x_c goes on from the newest tick
