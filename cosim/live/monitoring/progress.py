@@ -6,7 +6,14 @@ from contextlib import contextmanager
 from threading import Event, Thread
 
 from rich.console import Console
-from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    ProgressColumn,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.progress import Progress as RichProgress
 
 from noack.core.progress import Progress
@@ -17,8 +24,6 @@ _LINE_EVERY_S = 10.0
 """Time between two lines about some work, if there is no terminal."""
 _shown: list[Event] = []
 """Of the work whose lines are printed, the innermost one last."""
-_LEAST_SHARE = 0.1
-"""Of the work, from which on the remaining time is estimated: the first tries may take longer."""
 
 
 def error_console() -> Console:
@@ -28,7 +33,7 @@ def error_console() -> Console:
 
 @contextmanager
 def _bar(
-    console: Console, total: float, *columns: TextColumn | TimeRemainingColumn, description: str = ""
+    console: Console, total: float, *columns: ProgressColumn, description: str = ""
 ) -> Iterator[Callable[..., None]]:
     """Show a bar while the context lasts, on a terminal only; yields what updates it."""
     head = (TextColumn("{task.description}"),) if description else ()
@@ -108,19 +113,19 @@ def activity(text: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def work_bar(description: str, *, lines: bool = False) -> Iterator[Progress]:
-    """Show the completed share of some work, and an estimate of the remaining time.
+    """Show the completed share of some work, and for how long it has been done.
 
-    Where there is no terminal, print them as a line at intervals if ``lines``.
+    The rest of a search may take less than its share, or more. Where there is no terminal, print both as a
+    line at intervals if ``lines``.
     """
     console, share, began_s = error_console(), 0.0, time.monotonic()
-    columns = TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()
+    columns = TextColumn("{task.percentage:.0f} %"), TimeElapsedColumn()
 
     def line() -> str:
         spent_s = time.monotonic() - began_s
         if not 0 < share < 1:
             return f"{description}: {spent_s:.0f} s"
-        left = f", about {spent_s / share - spent_s:.0f} s left" if share >= _LEAST_SHARE else ""
-        return f"{description}: {100 * share:.0f} % after {spent_s:.0f} s{left}"
+        return f"{description}: {100 * share:.0f} % after {spent_s:.0f} s"
 
     with (
         _bar(console, 1.0, *columns, description=description) as update,

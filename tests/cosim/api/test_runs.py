@@ -87,7 +87,7 @@ def test_an_interrupted_live_run_is_returned() -> None:
     )
     with subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        # A terminal: no progress is printed to a pipe.
+        # A terminal: to a pipe progress is printed after ten seconds.
         env=os.environ | WITHOUT_VIEWER | {"FORCE_COLOR": "1", "TERM": "dumb"},
     ) as process:  # fmt: skip
         assert process.stderr is not None
