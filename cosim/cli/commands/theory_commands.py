@@ -174,8 +174,8 @@ def adversary(
 
     Exit status 1: a certified bound was exceeded.
 
-    Takes some 20 s if all patterns can be tried; otherwise about as long for each objective. Of a plant
-    that is not given by matrices, some hundred patterns are simulated.
+    Takes some 20 s if all patterns can be tried, and some minutes otherwise. Of a plant that is not given by
+    matrices, some hundred patterns are simulated.
     """
     from cosim.analysis import adversary as adversary_search
     from cosim.analysis.adversary.worst_run import BREACH, WorstRun

@@ -250,9 +250,11 @@ def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort, tried: Sequence[int] 
     if loop.rule.memory is not None and loop.holds:  # one test bounds no K e_s, the time since the event does
         pairs, shares = [(1, counted) for counted in _COUNTED], (0.3, 0.1, 0.02)
     for pieces, counted in pairs:
-        for rates in (_Rates(loop, slow=share, by_tests=by_tests) for share in shares):
-            if rates.rate > fastest:
+        for share in shares:
+            rates = _Rates(loop, slow=share, by_tests=by_tests)
+            if rates.rate > fastest and share != shares[-1]:
                 continue
+            rates.rate = min(rates.rate, fastest)
             rates.first_share, rates.moves = _SMALLEST_SHARE, (0,)
             document = {**first_assumptions(loop, rates.rate), "pieces": pieces}
             if by_tests:
