@@ -8,5 +8,6 @@
    set-point; ``common_end.py``: a stopped run; ``trajectory_delta.py``: Theorem 1's Δ from a
    trajectory.
 3. ``claim_catalogue.py``: the claims.
-4. ``claim_evaluation.py``: checks all of them.
+4. ``claim_evaluation.py``: checks all of them. ``cosim/output/run_verdict.py`` says of all claims of a
+   run whether its guarantee was kept.
 """

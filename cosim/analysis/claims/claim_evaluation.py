@@ -145,7 +145,7 @@ class _ClaimInstance(NamedTuple):
         """Check the next samples, and add to the curve, which is thinned if the run is long."""
         evidence = self.evidence
         bound, envelope = self.claimed.find(evidence, samples, self.certificate)
-        if evidence.facts.is_ever_bounded and bound is not None:
+        if evidence.facts.shares_an_update and bound is not None:
             if self.outside is not None:
                 bound = bound._replace(void=VoidFrom(0.0, self.outside))
             self.check.add(bound)
@@ -239,7 +239,7 @@ class RunClaims:
 
     def evaluate(self) -> list[Claim]:
         """Return every claim with its verdict."""
-        if not self.evidence.facts.is_ever_bounded:
+        if not self.evidence.facts.shares_an_update:
             return []
         if self.record.scenario.protocol.acknowledges:
             return [void_claim("x_c − x_s is the sum of the missed jumps", "(I1)", _ACKNOWLEDGED)]

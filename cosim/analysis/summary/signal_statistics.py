@@ -59,8 +59,8 @@ def _larger(before: float | None, values: Reals) -> float | None:
 class SampleFacts(NamedTuple):
     """What claims need to know about all samples of a run before they are checked."""
 
-    is_ever_bounded: bool = False
-    """Whether the error of the controller is bounded at any time."""
+    shares_an_update: bool = False
+    """Whether sensor and controller ever had the same update: before, nothing bounds ‖e_c‖."""
     gap_s: float | None = None
     """First time at which the controller's error is not known, although it was before."""
     largest_state: float = 0.0
@@ -84,7 +84,7 @@ class SampleFactsReader:
             return
         bounded = is_bounded(self._scenario, aligned) if bounded is None else bounded
         facts, t_s = self._facts, aligned.t_ns * 1e-9
-        started = np.logical_or.accumulate(bounded) | facts.is_ever_bounded
+        started = np.logical_or.accumulate(bounded) | facts.shares_an_update
         gaps = np.flatnonzero(started & ~bounded)
         gap_s = float(t_s[gaps[0]]) if facts.gap_s is None and len(gaps) else facts.gap_s
         both = np.concatenate([aligned.x_s, aligned.x_c.compress(bounded, axis=0)])

@@ -219,7 +219,8 @@ class ClaimVerdict(StrEnum):
     HELD = "held"
     VIOLATED = "violated"
     VOID = "void"
-    """An assumption of the claim was violated before the end of the run."""
+    """An assumption of the claim was violated before the end of the run, or it has none to hold: there is
+    no certificate, or a setting changed before anything could be compared."""
     NOT_APPLICABLE = "not applicable"
     """The bound was exceeded, but no sampled loop meets the claim's assumptions: this run does not
     refute it."""
