@@ -78,6 +78,8 @@ class Times(NamedTuple):
     """If it is not 0, the first test that counts after an event comes exactly this time after it."""
     longest: fmpq = fmpq(0)
     """Two events of a rule that compares are at most this far apart, as with a deadline; 0: not known."""
+    due: fmpq = fmpq(0)
+    """An event that comes without its comparison comes at least this time after the last one."""
 
     @property
     def least_apart(self) -> fmpq:

@@ -311,7 +311,7 @@ def _prove_quiet_start(loop: Loop) -> None:
     last = times.start if not times.sampling > 0 else _last_test_before(times, times.start)
     if last == 0:
         return
-    if rule.always or not rule.positive.nrows():
+    if (rule.always and not times.due > last) or not rule.positive.nrows():
         raise RejectedError("times: an event without a comparison may happen before the first input acts")
     if not _exceeds_by_error(loop):
         raise RejectedError("times: an event of this rule may happen before the first input acts")
@@ -368,8 +368,10 @@ def prove_first_event(loop: Loop, drift: Bound, first: arb, until: fmpq) -> None
     rule = loop.rule
     if first == 0:
         return
-    if rule.always or not compares_error(loop) or not first > 0:
+    if not compares_error(loop) or not first > 0:
         raise RejectedError("first_event_s: not proven for this rule; 0 is")
+    if rule.always and not first < arb(loop.times.due):
+        raise RejectedError("first_event_s: an event without a comparison may come earlier")
     largest, total = growth(weighted(loop, arb(0)), first)
     added = total * (drift.decaying**2 + drift.constant**2).sqrt()
     threshold = (rule.level * (-rule.rate * first).exp()).max(rule.floor)
@@ -469,9 +471,14 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: fmpq) -> None
 
 
 def _require_silent(loop: Loop, apart: fmpq) -> None:
-    """Require that events need the comparison of ‖W e_s‖, if a time between them is stated."""
-    if apart != 0 and (loop.rule.always or not compares_error(loop) or not apart > 0):
+    """Require that events need the comparison of ‖W e_s‖, if a time between them is stated.
+
+    Those that come without it, as at a deadline, may come at ``times.due``: what is stated is less.
+    """
+    if apart != 0 and (not compares_error(loop) or not apart > 0):
         raise RejectedError("inter_event_s: not proven for this rule; 0 is")
+    if apart != 0 and loop.rule.always and not apart < loop.times.due:
+        raise RejectedError("inter_event_s: an event without a comparison may come earlier")
 
 
 def _require_below(loop: Loop, rate: arb, reached: Callable[[arb], arb], *, is_decaying: bool) -> None:

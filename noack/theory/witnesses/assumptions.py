@@ -5,11 +5,12 @@ itself. Nothing here has to be right: :mod:`noack_check.proof` proves what is as
 """
 
 import contextlib
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from flint import fmpq
+from flint import arb, fmpq
 from scipy.linalg import expm, logm, schur, solve_continuous_lyapunov
 
 from noack.core.linear_systems import Matrix
@@ -214,7 +215,7 @@ def inter_event_s(loop: Loop, rate: float, drift: Sequence[float]) -> float:
     level, floor = float(loop.rule.level), float(loop.rule.floor)
     if rate != float(loop.rule.rate):
         level = 0.0
-    if loop.rule.always or loop.rule.negative.nrows() or not (floor or (level and not D2 and not noise2)):
+    if loop.rule.negative.nrows() or not (floor or (level and not D2 and not noise2)):
         return 0.0
     triples = [
         (max(level * v, floor), float(np.hypot(D1 * v, D2)), noise1 * v + noise2)
@@ -234,13 +235,18 @@ def inter_event_s(loop: Loop, rate: float, drift: Sequence[float]) -> float:
         return 0.0
     time = min((limit / size for limit, size, _ in triples if size), default=0.0)
     if not time:  # nothing drives the errors, so no time is the least one
-        return 0.0
+        return before_due(loop) if loop.rule.always else 0.0
     for _ in range(_MOST_STEPS):
         reached = share(time)
         if _NEARLY < reached < 1:
             break
         time *= ((1 + _NEARLY) / 2 - at_once) / (reached - at_once)
-    return time if reached < 1 else 0.0
+    return min(time, before_due(loop)) if reached < 1 else 0.0
+
+
+def before_due(loop: Loop) -> float:
+    """Return a time before which no event comes without the rule's comparison; infinite: each needs it."""
+    return (1 - 1e-9) * float(arb(loop.times.due)) if loop.rule.always else math.inf
 
 
 def first_event_s(loop: Loop, drift: Sequence[float], most: float) -> float:

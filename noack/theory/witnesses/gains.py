@@ -10,7 +10,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix
 from noack.theory.response_bounds import NotDecayingError, lyapunov_decay
-from noack.theory.witnesses.assumptions import observer_decay
+from noack.theory.witnesses.assumptions import before_due, observer_decay
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.apart import share_of_threshold
@@ -90,8 +90,8 @@ def _gains(
         gains = Gains(loop, number(rate), table)
     except RejectedError as error:
         raise NoWitnessError(str(error)) from None
-    if compares_error(loop) and not loop.rule.always:
-        table["inter_event_s"] = _inter_event_s(gains)
+    if compares_error(loop):
+        table["inter_event_s"] = min(_inter_event_s(gains), before_due(loop))
     return table, gains
 
 
