@@ -89,6 +89,8 @@ def random_loop_with_long_delays(rng: np.random.Generator) -> Loop:
         rule = rule._replace(positive=rule.positive * number(round(float(rng.uniform(0.5, 5)), 2)))
     rule = rule._replace(always=bool(kind == "deadline"))
     times = loop.times._replace(sampling=sampling, least_sampling=least, delay=delay, start=min(start, delay))
+    if rule.always:
+        times = times._replace(due=least * int(rng.integers(0, 10)))
     return loop._replace(rule=rule, times=times)
 
 
@@ -109,7 +111,8 @@ def random_due_loop(rng: np.random.Generator) -> Loop:
     loop = random_loop(rng)
     rule = loop.rule._replace(always=True, level=arb(0), floor=number(2.0))
     longest = loop.times.sampling * int(rng.integers(2, 12))
-    return loop._replace(rule=rule, times=loop.times._replace(longest=longest))
+    due = min(loop.times.least_sampling * int(rng.integers(0, 12)), longest)
+    return loop._replace(rule=rule, times=loop.times._replace(due=due, longest=longest))
 
 
 def random_area_loop(rng: np.random.Generator) -> Loop:

@@ -70,7 +70,7 @@ def exceeded(
 ) -> list[Exceeded]:
     """Return where a random run exceeds what is proven; by forms this is a root of a sum of squares."""
     plant, times, rule = _Plant(loop, rng), [float(t.p) / float(t.q) for t in loop.times], loop.rule
-    sampling, least, delay, age, start, *periods, dwell, longest = times
+    sampling, least, delay, age, start, *periods, dwell, longest, due = times
     next_event = rng.choice(periods) if periods[1] else np.inf  # of a periodic rule
     if periods[1] and loop.observer is None:
         least = sampling = periods[1] / _PARTS
@@ -141,7 +141,8 @@ def exceeded(
             eta = remembered.at_test(sampling)
             threshold = np.hypot(max(level * np.exp(-rate * t), floor), np.linalg.norm(negative @ seen))
             threshold = np.hypot(threshold, np.sqrt(max(eta, 0.0)))
-            fires = np.linalg.norm(positive @ seen) > threshold or (rule.always and rng.random() < 0.2)
+            may_come = rule.always and t - events[-1] > due - 1e-9  # without the comparison
+            fires = np.linalg.norm(positive @ seen) > threshold or (may_come and rng.random() < 0.2)
             if rule.integrates:
                 now = float(np.linalg.norm(positive @ seen))
                 area += (t - last_test) * (now + last_size) / 2

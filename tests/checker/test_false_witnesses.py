@@ -229,6 +229,22 @@ def test_events_without_a_comparison_may_come_before_the_first_input() -> None:
     _prove_quiet_start(loop)
     with pytest.raises(RejectedError, match="without a comparison"):
         _prove_quiet_start(loop._replace(rule=loop.rule._replace(always=True)))
+    due = loop._replace(rule=loop.rule._replace(always=True), times=loop.times._replace(due=loop.times.start))
+    _prove_quiet_start(due)
+
+
+def test_no_time_between_events_is_as_long_as_until_one_is_due() -> None:
+    """The test at this time may be an event, whatever is compared."""
+    plain = double_integrator()
+    due = fmpq(int(500 * float(str(find_witness(plain).document["inter_event_s"]))), 1000)
+    times = plain.times._replace(due=due)
+    loop = plain._replace(rule=plain.rule._replace(always=True), times=times)
+    document = find_witness(loop).document
+    apart = float(str(document["inter_event_s"]))
+    assert 0.999 < apart / float(arb(due)) < 1
+    rejects(loop, {**document, "inter_event_s": float(arb(due))}, "without a comparison may come earlier")
+    rejects(loop, {**document, "first_event_s": float(arb(due))}, "without a comparison may come earlier")
+    rejects(loop._replace(times=times._replace(due=due / 2)), document, "without a comparison")
 
 
 def test_a_start_is_quiet_only_if_the_error_is_what_is_compared() -> None:

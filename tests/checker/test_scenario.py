@@ -200,6 +200,18 @@ def test_rules_are_those_of_noack(trigger: str) -> None:
     assert times_ns(loop)[1] <= conditions_ns(resolved)[1]
 
 
+@pytest.mark.parametrize("interval_s", [0.5, 0.501])
+def test_an_event_is_due_no_sooner_than_at_the_deadline(interval_s: float) -> None:
+    trigger = f'policy="deadline", interval_s={interval_s}, rule={{policy="absolute", delta=0.1}}'
+    tables = tables_of(first_loop("double_integrator", f"trigger={{{trigger}}}"))
+    times = read_loop(tables, box=False, ideal=False).times
+    assert fmpq(1, 2) <= times.due <= times.longest
+    assert float(arb(times.due)) >= interval_s
+    assert read_loop(tables, box=False, ideal=True).times.due == fmpq(round(1000 * interval_s), 1000)
+    undue = tables_of(first_loop("double_integrator", 'trigger={policy="absolute", delta=0.1}'))
+    assert read_loop(undue, box=False, ideal=False).times.due == 0
+
+
 def test_constraints_can_lower_the_most_losses() -> None:
     settings = 'network.constraints=[{kind="at_most", losses=2, window=10}, {kind="recovery", deliveries=3}]'
     resolved = first_loop("double_integrator", settings, "network.mansd=4")
