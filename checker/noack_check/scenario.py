@@ -414,14 +414,14 @@ def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
         dwell = fmpq(intervals.dwell, NS_PER_S)
         times = times._replace(dwell=(dwell / sampling).ceil() * sampling if sampling > 0 else dwell)
     if intervals.longest and not (outer and inner.get("heartbeat")):
-        due, longest = fmpq(intervals.shortest, NS_PER_S), fmpq(intervals.longest, NS_PER_S)
+        first_due, longest = fmpq(intervals.shortest, NS_PER_S), fmpq(intervals.longest, NS_PER_S)
         if not ideal:
             schedule = read_schedule(resolved)
-            due = schedule.between_events(intervals.shortest)[0]
+            first_due = schedule.between_events(intervals.shortest)[0]
             longest = schedule.between_events(intervals.longest)[1]
         elif outer:
             longest += sampling
-        times = times._replace(due=due, longest=longest)
+        times = times._replace(due=first_due, longest=longest)
     return times
 
 
