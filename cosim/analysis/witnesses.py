@@ -7,6 +7,7 @@ the loop from the resolved scenario itself.
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from itertools import islice
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import with_stated_numbers
 from noack.theory.certificates.plant_equations import equations_of
 from noack.theory.certificates.proven_bounds import ProvenBounds
-from noack.theory.witnesses.documents import Witness, find_witness, witness_by_gains
+from noack.theory.witnesses.documents import Witness, find_witness, forms_or_gains, witness_by_gains
 from noack.theory.witnesses.effort import MOST_WORK, NoWitnessError
 from noack.theory.witnesses.outward import proven_bounds
 from noack.theory.witnesses.regions import (
@@ -303,11 +304,13 @@ def known_or_found_on_region(
     outputs, ultimate = _wanted(loop, has_outputs=has_outputs)
 
     def search() -> Witness:
-        if not most_work:
+        def by_gains() -> Witness:
             return region_witness_by_gains(plant, (*outputs, "e_s", *ultimate))
-        return find_region_witness(
-            plant, outputs, ultimate=ultimate, near=near, progress=progress, most_work=most_work
-        )
+
+        if not most_work:
+            return by_gains()
+        by_forms = partial(find_region_witness, plant, outputs, ultimate=ultimate, near=near)
+        return forms_or_gains(partial(by_forms, progress=progress, most_work=most_work), by_gains)
 
     def loop_on(document: Mapping[str, object]) -> Loop:
         region = read_region(document, loop.n, loop.B.ncols())

@@ -103,6 +103,12 @@ REASONS = {
 }
 
 
+def test_a_loop_is_searched_although_a_similar_one_decays_more_slowly() -> None:
+    """So with the box of a plant: the rates that are tried are those of the box's centre."""
+    near = {"rate": 0.001, "bounds": []}
+    assert find_witness(EXACT, ("x",), near=[near]).document["rate"] == 0.001
+
+
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_witness_proves_nothing_about_another_loop(found: tuple[Loop, Witness], change: str) -> None:
     loop, witness = found

@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -97,12 +97,24 @@ def find_witness(
         NoWitnessError: none was found.
     """
     wanted = _Wanted(outputs, ultimate, [document for document in near if "bounds" in document])
+    with np.errstate(over="ignore", invalid="ignore"):  # of huge states; the checker decides
+        return forms_or_gains(
+            lambda: _by_forms(loop, wanted, Effort(progress, most_work)),
+            lambda: witness_by_gains(loop, wanted.by_gains),
+        )
+
+
+def forms_or_gains(by_forms: Callable[[], Witness], by_gains: Callable[[], Witness]) -> Witness:
+    """Return a witness by quadratic forms, or one by gains.
+
+    Raises:
+        NoWitnessError: there is neither, for both reasons.
+    """
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # of huge states; the checker decides
-            return _by_forms(loop, wanted, Effort(progress, most_work))
+        return by_forms()
     except NoWitnessError as of_forms:
         try:
-            return witness_by_gains(loop, wanted.by_gains)
+            return by_gains()
         except NoWitnessError as of_gains:
             raise type(of_forms)(f"{of_forms}; {of_gains}") from None
 

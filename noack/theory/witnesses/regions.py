@@ -72,24 +72,6 @@ def find_region_witness(
     Raises:
         NoWitnessError: none was found; the message names the region that would be needed.
     """
-    try:
-        return _by_forms(plant, outputs, ultimate, near, progress, most_work)
-    except NoWitnessError as of_forms:
-        try:
-            return region_witness_by_gains(plant, (*outputs, "e_s", *ultimate))
-        except NoWitnessError as of_gains:
-            raise type(of_forms)(f"{of_forms}; {of_gains}") from None
-
-
-def _by_forms(
-    plant: PlantOnRegions,
-    outputs: Sequence[str],
-    ultimate: Sequence[str],
-    near: Sequence[Mapping[str, object]],
-    progress: Progress,
-    most_work: float,
-) -> Witness:
-    """Return a witness by quadratic forms."""
     effort = Effort(part_of(progress, 0.0, 0.5), most_work)
     effort.expect(_EXPECTED)
     restricted = _restricted(plant)

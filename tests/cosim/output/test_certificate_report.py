@@ -360,3 +360,17 @@ def test_what_keeps_a_guarantee_is_not_known_beyond_a_jump_of_the_reference() ->
         assert certificate.inter_event_s
         (kept,) = [each.why for each in certificate.assumptions if each.why.startswith("not enforced")]
         assert kept.endswith("or more (computed)") != jumps
+
+
+def test_a_box_without_a_proof_is_said() -> None:
+    words = ["certify", "f16_lateral", "--no-search", "--set"]
+    without = invoke(*words, "plant.measure_every=5").stdout
+    assert "nothing is proven for the stated uncertainty" in " ".join(without.split())
+    assert "nothing is proven" not in invoke(*words, "plant.measure_every=1").stdout
+
+
+def test_a_region_that_is_not_found_leaves_the_bounds_by_gains() -> None:
+    statement = find_statement(resolved("sine_pendulum"), "region", "schedule", most_work=1e-9)
+    assert statement.document is not None
+    assert "gains" in statement.document
+    assert "bounds" not in statement.document
