@@ -9,7 +9,8 @@
 
 enum {
     FEW_BUFFERS = 16,
-    BUSY_NS = 10000 /* a datagram that comes so soon after others is expected to be one of many */
+    BUSY_NS = 10000, /* a datagram that comes so soon after others is expected to be one of many */
+    STALL_NS = 10000000 /* a wait that ends later than that: the relay was stopped meanwhile */
 };
 
 enum { NO_CLIENT = -1, REFUSED = -2, FIRST_CLIENTS = 64, HEADROOM_BYTES = 48 * 1024 * 1024 };
@@ -384,8 +385,10 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
     }
     scratch->ready_count = max_of(ready, 0);
     scratch->ready_next = 0;
-    if (scratch->ready_count == 0)
+    if (scratch->ready_count == 0) {
         relay->read_ns = run_time_ns(&relay->clock);
+        scratch->has_more = ready < 0;
+    }
     return ready >= 0;
 }
 
@@ -412,7 +415,7 @@ static int receive(noack_relay *relay, int64_t socket, int flags) {
     if (scratch->stamps)
         scratch->real_ns = clock_ns(CLOCK_REALTIME);
     scratch->is_busy = received > 1 || relay->read_ns - before_ns < BUSY_NS;
-    scratch->has_more = scratch->is_busy && received == most;
+    scratch->has_more = error == EINTR || (scratch->is_busy && received == most);
     if (received > 0) {
         scratch->batch_socket = socket;
         scratch->batch_next = begin;
@@ -447,6 +450,23 @@ static int wait_and_receive(noack_relay *relay) {
     return error != EINTR;
 }
 
+/* Do not count the time in which the relay was stopped as one for which housekeeping was put off:
+   the datagrams that arrived meanwhile come first. */
+static void leave_out_stall(noack_relay *relay, int64_t wait_until_ns) {
+    relay_scratch *scratch = scratch_of(relay);
+    int64_t late_ns = relay->read_ns - wait_until_ns;
+    if (scratch->due_since_ns != 0 && noack_clock_wait_ns(&relay->clock, late_ns) > STALL_NS)
+        scratch->due_since_ns += late_ns;
+}
+
+/* Wait for datagrams or the next release time; return 0 if a signal interrupted it. */
+static int wait_until(noack_relay *relay, int64_t until_ns) {
+    int in_receive = receiving_waits(relay, until_ns);
+    int completed = in_receive ? wait_and_receive(relay) : wait_for_datagrams(relay, until_ns);
+    leave_out_stall(relay, until_ns);
+    return completed;
+}
+
 int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
     relay_scratch *scratch = scratch_of(relay);
     for (;;) {
@@ -472,8 +492,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
             if (wait_until_ns == INT64_MIN)
                 return NOACK_HOUSEKEEPING;
             scratch->pauses.worked_since_wait = 0;
-            int in_receive = receiving_waits(relay, wait_until_ns);
-            if (!(in_receive ? wait_and_receive(relay) : wait_for_datagrams(relay, wait_until_ns)))
+            if (!wait_until(relay, wait_until_ns))
                 return NOACK_INTERRUPTED;
         }
         if (scratch->ready_next < scratch->ready_count)

@@ -75,9 +75,9 @@ typedef struct relay_scratch {
     int64_t control_bytes; /* buffer for received control messages; 0: none */
     noack_pauses pauses;   /* work is sending */
     int64_t is_busy;       /* 1: the next datagrams may come together */
-    int64_t has_more;      /* 1: as many as could be received were; others may wait */
-    int64_t due_since_ns;  /* since when housekeeping has been due; 0: it is not */
-    uint64_t loaded;       /* a sum of what was loaded into the caches, so that it is loaded */
+    int64_t has_more; /* 1: others may wait: as many as could be were received, or a signal came */
+    int64_t due_since_ns; /* since when housekeeping has been due; 0: it is not */
+    uint64_t loaded;      /* a sum of what was loaded into the caches, so that it is loaded */
     _Alignas(64) uint8_t buffers[BUFFERS][BUFFER_STRIDE];
 } relay_scratch;
 
