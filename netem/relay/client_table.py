@@ -48,8 +48,10 @@ class ClientTable:
         self._outside_rows: set[int] = set()
         """Flows through the devices of a shell that began outside."""
         self._not_queried: Iterator[int] = iter(())
+        self._without_path: set[int] = set()
+        """Clients whose return path could not be opened."""
         self._idle_ns = np.array([round(link.spec.idle_s * 1e9) for link in links], np.int64)
-        self._expired_ns = 0
+        self._expired_ns = self._next_idle_ns = 0
 
     def add(self, link: int, name: bytes, *, from_outside: bool = False) -> None:
         """Add a client by its packed name; if that is impossible, refuse clients until one leaves.
@@ -79,28 +81,21 @@ class ClientTable:
 
     def expire(self, now_ns: int) -> None:
         """Remove the clients that have been idle and have no datagram in flight."""
-        clients = self._memory.clients
         if now_ns - self._expired_ns > _STALL_NS:
             # The relay was stopped: datagrams that arrived meanwhile have not been read yet.
-            clients["last_ns"] = now_ns
+            self._memory.clients["last_ns"] = now_ns
         self._expired_ns = now_ns
-        since_ns = now_ns - self._idle_ns[clients["link"]]
-        idle = (clients["number"] >= 0) & (clients["last_ns"] < since_ns)
-        for row in np.flatnonzero(idle & (clients["in_flight"] == 0)).tolist():
-            path = self._paths.get(row)
-            if path is None or not has_data(path):
-                self._forget(row)
+        if now_ns > self._next_idle_ns:
+            self._remove_idle(now_ns)
         for link, present in enumerate(self.present_counts):
             if present == 0:  # full for lack of a file descriptor; no client can make room
                 self._set_full(2 * link, False)
 
     def reconnect(self) -> None:
         """Open the return paths again that could not be opened before."""
-        sockets, first = self._memory.sockets, self._memory.first_path
-        clients = self._memory.clients
-        for row in np.flatnonzero(sockets["error"][first:]).tolist():
-            server = self._links[clients["link"][row]].server
-            path, sockets["error"][first + row] = return_path(server)
+        for row in tuple(self._without_path):
+            server = self._links[self._memory.core.clients[row].link].server
+            path, self._socket(row).error = return_path(server)
             if path is not None:
                 self._set_path(row, path)
 
@@ -141,6 +136,19 @@ class ClientTable:
             path.close()
         self._paths.clear()
 
+    def _remove_idle(self, now_ns: int) -> None:
+        """Remove idle clients; note when the next one can be idle."""
+        clients = self._memory.clients
+        present = clients["number"] >= 0
+        idle_from_ns = clients["last_ns"] + self._idle_ns[clients["link"]]
+        for row in np.flatnonzero(present & (idle_from_ns < now_ns) & (clients["in_flight"] == 0)).tolist():
+            path = self._paths.get(row)
+            if path is None or not has_data(path):
+                self._forget(row)
+        # Clients that come later are idle no sooner than those that come now.
+        of_new_ns = now_ns + int(self._idle_ns.min())
+        self._next_idle_ns = int(idle_from_ns[present].min(initial=of_new_ns))
+
     def _accept(self, link: int, name: bytes, path: Endpoint | None, error: int) -> int:
         """Add a client; return its row."""
         if not self._free_rows:
@@ -167,6 +175,8 @@ class ClientTable:
         self._socket(row).error, self._socket(row).fd = error, -1
         if path is not None:
             self._set_path(row, path)
+        elif error:
+            self._without_path.add(row)
         return row
 
     def _socket(self, row: int) -> CData:
@@ -177,6 +187,7 @@ class ClientTable:
         if self._directions[2 * memory.core.clients[row].link + 1].can_reorder:
             stamp_arrivals(path)
         self._paths[row] = path
+        self._without_path.discard(row)
         self._drops[row] = 0
         memory.watch(path.fileno(), memory.first_path + row)
 
@@ -190,6 +201,7 @@ class ClientTable:
             self._paths.pop(row).close()
         client.number = self._socket(row).fd = -1
         self._socket(row).error = 0
+        self._without_path.discard(row)
         self._free_rows.append(row)
         self._free_flow_rows[link].append(client.flow_row)
         self.present_counts[link] -= 1

@@ -194,9 +194,10 @@ class Relay:
     def _send_errors(self) -> Iterator[tuple[int, int, int]]:
         """Yield direction, errno and number of datagrams that could not be sent or stored."""
         for number, direction in enumerate(self._directions):
-            counts = direction.counts_of("errors")
-            for error in np.flatnonzero(counts).tolist():
-                yield number, error, int(counts[error])
+            if direction.has_errors:
+                counts = direction.counts_of("errors")
+                for error in np.flatnonzero(counts).tolist():
+                    yield number, error, int(counts[error])
 
     def _report_direction(self, number: int) -> DirectionReport:
         direction = self._directions[number]

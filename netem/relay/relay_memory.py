@@ -16,6 +16,10 @@ _ROWS = 16
 """Flows of a direction for which there is room at first."""
 
 
+_NO_ERRORS = bytes(ffi.sizeof("int64_t") * core.NOACK_ERRNOS)
+"""The memory of a direction's ``errors``, before there are any."""
+
+
 class RelayMemory:
     """A ``noack_relay`` of a number of links, with its tables.
 
@@ -124,6 +128,11 @@ class RelayDirection(LinkState):
     def counts_of(self, name: str) -> Integers:
         """Return a copy of ``delays``, ``lateness`` or ``errors`` of its ``noack_direction``."""
         return np.frombuffer(ffi.buffer(getattr(self.row, name)), np.int64).copy()
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether any datagram could not be sent or stored."""
+        return bytes(ffi.buffer(self.row.errors)) != _NO_ERRORS
 
     def _set_keeps(self) -> None:
         flips_bits = any(impairment.flips_bits for impairment in self.settings.impairments)

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from netem.relay import client_table
 from netem.relay.relay_reports import DirectionReport
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
@@ -204,6 +205,21 @@ def test_a_link_without_clients_tries_again_after_a_lack_of_descriptors() -> Non
         emulator.until(lambda: not emulator.relay._directions[0].row.full)
         client.sendto(b"now", emulator.address())
         assert emulator.receive(server)[0][0] == b"now"
+
+
+def test_a_return_path_that_could_not_be_opened_is_opened_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    lost = {"lost_in_kernel": 0, os.strerror(errno.ENETUNREACH): 1}
+    with relayed(clients=2) as (server, client, other, emulator):
+        with monkeypatch.context() as patch:
+            patch.setattr(client_table, "return_path", lambda _: (None, errno.ENETUNREACH))
+            client.sendto(b"before", emulator.address())
+            emulator.until(lambda: emulator.report().forward.unintended == lost)
+        other.sendto(b"other", emulator.address())
+        assert emulator.receive(server)[0][0] == b"other"
+        emulator.until(lambda: not emulator.relay._clients._without_path)
+        client.sendto(b"after", emulator.address())
+        assert emulator.receive(server)[0][0] == b"after"
+        assert emulator.report().forward.unintended == lost
 
 
 @pytest.mark.parametrize("return_path", [True, False])
