@@ -73,11 +73,8 @@ def _pattern(worst: WorstRun) -> Iterator[Block]:
     """Yield how the worst run was found, and its losses."""
     time_text = "" if worst.at_s is None else f"worst at {worst.at_s:.6f} s; "
     coverage = "all patterns searched" if worst.exact else "not all patterns searched"
-    speed = (
-        f"{counted(worst.runs, 'run')}; {counted(worst.nodes, 'segment')}, "
-        f"{worst.nodes / worst.elapsed_s:,.0f} per second"
-    )
-    outcome = "the loop diverges" if worst.diverges else f"{time_text}{coverage} ({speed})"
+    found = f"{time_text}{coverage} ({counted(worst.runs, 'run')})"
+    outcome = "the loop diverges" if worst.diverges else found
     yield _prose(f"{worst.objective.value}: {outcome}")
     yield Sentence(text=f"  {worst.text}")
 

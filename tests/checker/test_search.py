@@ -189,6 +189,14 @@ def test_a_disturbance_shortens_the_time_between_events_as_little_as_possible() 
     assert float(apart) > 0.02
 
 
+def test_both_parts_of_a_bound_of_the_controllers_error_are_some_thresholds() -> None:
+    """Of 0.05 and 0.0005. In one unit the second part counts for nothing, and is 31 of its thresholds."""
+    loop = double_integrator(floor=0.0005)._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(0.0005),))
+    by_forms = next(bound for bound in find_witness(loop, ("e_c",)).proof.bounds if bound.output == "e_c")
+    assert by_forms.decaying < 10 * 0.05
+    assert by_forms.constant < 10 * 0.0005
+
+
 def test_steps_are_improved_where_rounding_errors_end_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
     solve, improved = semidefinite._Problem.solve, []
 

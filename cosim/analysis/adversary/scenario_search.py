@@ -6,7 +6,6 @@ nodes. If this covers all patterns, the result is exact: no admissible pattern i
 """
 
 import math
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -87,7 +86,6 @@ def _find_worst(
     report: SearchReport,
 ) -> WorstRun:
     """Search the losses; with bounded disturbances, alternate with these."""
-    began_s = time.monotonic()
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
     own_run = run_sampled(flow, network_fates(resolved))
     first_event = 0 if flow.loop.known_start else 1
@@ -120,7 +118,6 @@ def _find_worst(
         lossless=reported_value(lossless.value, objective),
         with_own_network=reported_value(own_run.value, objective),
         certified=flow.certified,
-        elapsed_s=time.monotonic() - began_s,
     )
 
 

@@ -5,7 +5,6 @@ that differ from the worst of them in the outcome of one event. All objectives a
 """
 
 import math
-import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -68,7 +67,6 @@ def find_worst_by_runs(
         most_runs: number of runs, about.
         report: receives the progress.
     """
-    began_s = time.monotonic()
     runs = _PatternRuns(resolved, certificate, objectives, report)
     lossless, own_fates = runs.of(()), network_fates(resolved)
     events = len(runs.of((False,) * 8 * (len(lossless.pattern) + 1)).pattern)  # losses bring more events
@@ -97,7 +95,6 @@ def find_worst_by_runs(
                 lossless=reported_value(lossless.values[objective][0], objective),
                 with_own_network=reported_value(own.values[objective][0], objective),
                 certified=_certified(certificate, objective),
-                elapsed_s=time.monotonic() - began_s,
             )
         )
     return WorstByRuns(found, runs.shares())

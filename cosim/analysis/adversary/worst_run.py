@@ -1,7 +1,7 @@
 """The worst run that the adversary found, as values."""
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 
 from cosim.analysis.adversary.loop_flows import Objective, Pattern
 from noack.guarantee.loss_guarantee import outcome_letters
@@ -40,8 +40,6 @@ class WorstRun:
     """The value with the losses of the scenario's own network."""
     certified: float | None
     """The certificate's bound; None without a certificate."""
-    elapsed_s: float = field(compare=False)
-    """Wall time of the search."""
 
     @property
     def tightness(self) -> float | None:

@@ -162,7 +162,7 @@ def adversary(
         int,
         Option(
             min=0,
-            help="Limit of the exhaustive search for each objective, in segments between events (of "
+            help="Limit of the exhaustive search for each objective, in times between events (of "
             "some 0.3 s at 500 steps per second: about 25,000 per second); at the limit, the result "
             "of the beam search may be better.",
         ),

@@ -182,7 +182,7 @@ def search_activity() -> Iterator[Callable[[str], Callable[[str, int, float], No
 
         def named(aim: str) -> Callable[[str, int, float], None]:
             return lambda search, nodes, value: change(
-                f"worst {aim}: {search}, {nodes:,} segments, {abs(value):.6g} so far"
+                f"worst {aim}: {search}, {nodes:,} events, {abs(value):.6g} so far"
             )
 
         yield named

@@ -364,11 +364,14 @@ def _outputs(record: RunRecord, bounds: Mapping[str, list[Curve]]) -> PageFigure
             axes = figure.add_axes((0, 0, 1, 1))
             title = f"{label_text(output.name)}: distance from its {target}"
             draw_norms(axes, title, curves, bounds[output.name])
-            if output.allowed is not None:  # what is far within is of no interest
-                least = _LEAST_SHOWN * output.allowed
-            else:  # nor how near the samples are to the moment at which it is 0
-                least = np.quantile(curves[0].values, _RARE) / 2 if len(curves[0].values) else 0.0
-            axes.set_ylim(bottom=max(axes.get_ylim()[0], least))
+            low, high = axes.get_ylim()
+            values = curves[0].values
+            if output.allowed is not None:  # what is far within is of no interest, unless all is
+                low = _LEAST_SHOWN * min(output.allowed, values.max(initial=0.0))
+            elif len(values):  # nor how near the samples are to the moment at which it is 0
+                low = max(low, np.quantile(values, _RARE) / 2)
+            if 0 < low < high:
+                axes.set_ylim(bottom=low)
             unit = f" [{label_text(output.unit)}]" if output.unit else ""
             axes.set_ylabel(f"distance{unit}")
             set_times(axes, curves[0].t_s, labelled=i == len(drawn) - 1)

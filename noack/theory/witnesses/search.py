@@ -16,6 +16,8 @@ from noack.theory.witnesses.templates import Template, Templates
 
 _CONSTANT_WEIGHT = 100.0
 """Of D₂² of an output."""
+_OF_THRESHOLDS = ("drift", "e_s", "e_c")
+"""What is measured in the thresholds c and f."""
 FREE = ("c", "eta")
 """Numbers with such names may be negative."""
 _SHORT = "short by/"
@@ -112,7 +114,7 @@ class Search:
         if not starts:
             return {"level 1": 1e-6, "level 2": 1.0}
         level, floor = float(self.model.level), float(self.model.floor)
-        if output == "drift" and level and floor:
+        if output in _OF_THRESHOLDS and level and floor:
             return {"level 1": floor / level, "level 2": level / floor}
         return {"level 1": 1.0, "level 2": _CONSTANT_WEIGHT if output.startswith("y[") else 1.0}
 

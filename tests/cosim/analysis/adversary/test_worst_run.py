@@ -9,7 +9,7 @@ from cosim.analysis.adversary.worst_run import WorstRun
 
 WORST = WorstRun(
     Objective.STATE, 10.0, value=3.0, at_s=1.0, pattern=(True, False), event_s=(0.5, 1.0), exact=True,
-    nodes=4, runs=2, lossless=1.0, with_own_network=2.0, certified=4.0, elapsed_s=0.1,
+    nodes=4, runs=2, lossless=1.0, with_own_network=2.0, certified=4.0,
 )  # fmt: skip
 
 

@@ -160,6 +160,17 @@ def test_outputs_share_the_axis_of_time_and_their_zeros_do_not_stretch_the_other
     assert np.mean(offset < bottom) < 0.02
 
 
+def test_an_output_far_within_its_allowed_error_is_drawn() -> None:
+    """All of it is below the part of the allowed error from which on distances are shown."""
+    outputs = [{"name": "offset", "row": [1.0, 0.0, 0.0, 0.0], "allowed": 1e9}]
+    settings = {"horizon_s": 2.0, "outputs": outputs, "certificate.prove": False}
+    run = noack.simulate(noack.load("lane_following", settings))
+    (axes,) = run._describe("outputs").draw().axes
+    low, high = axes.get_ylim()
+    offset = axes.lines[0].get_ydata()
+    assert low < np.max(offset) < high
+
+
 @pytest.mark.parametrize("name", ["servo_reference", "dc_motor_load"])
 def test_the_norm_is_the_distance_that_is_bounded(name: str) -> None:
     """About a reference, or where the loop rests under its load: x itself is at 1.6, and the load at 0.2."""
