@@ -19,7 +19,7 @@ from benchmarks.relay_load import SOCAT, LoadedRelay, c_relay, our_relay
 from benchmarks.report import Goal, MeasurementError, Row, benchmark
 from benchmarks.rounds import Figures, Rounds, quantiles_us
 
-ROUNDS = 2
+ROUNDS = 9
 WORDS = "loss 5% mansd 4 seed 7"
 PLAIN, SEGMENTS = "ours", "ours, segments"
 REVERSE = "ours, with the reverse direction"
@@ -45,7 +45,7 @@ def drained() -> Iterator[Row]:
     yield rounds.row(f"{PLAIN}: cost", "µs CPU each", "cpu_us", PLAIN, "C relay", paired=True)
 
 
-FLOW_ROUNDS, FLOWS = 2, 10_000
+FLOW_ROUNDS, FLOWS = 3, 10_000
 PATHS = "C relay, a socket per client"
 ONE_FLOW, ALL = ", one flow", f", {FLOWS:,} flows"
 
@@ -73,8 +73,8 @@ def flows() -> Iterator[Row]:
         yield rounds.row(f"{name}{ALL}: cost", "µs CPU each", "cpu_us", name + ALL, peer, goal, paired=True)
 
 
-PING_ROUNDS, PINGS = 2, 500
-LINE_ROUNDS, LINE_ROUND_S = 1, 2
+PING_ROUNDS, PINGS = 5, 500
+LINE_ROUNDS, LINE_ROUND_S = 5, 2
 PERIOD_NS = 970_000
 """Not a divisor of the delay: else each datagram would be due when the arrival of a later one has
 just woken the relay."""
