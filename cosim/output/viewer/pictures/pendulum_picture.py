@@ -38,7 +38,7 @@ class PendulumPicture(draw.Picture):
     ) -> None:
         self._position, self._angle = position, angle
         self.title = {
-            (False, True): "The pendulum",
+            (False, True): "The angle, from upright",
             (True, True): "The cart and its pole",
             (True, False): "The cart on its rail",
         }[position is not None, angle is not None]
