@@ -8,10 +8,11 @@ import pytest
 from flint import arb, fmpq
 
 from cosim.analysis.certificates import Certificates
+from noack.core.progress import no_progress
 from noack.theory.witnesses import semidefinite
 from noack.theory.witnesses.assumptions import first_assumptions
 from noack.theory.witnesses.coordinates import floats, simulated_frames
-from noack.theory.witnesses.documents import find_witness
+from noack.theory.witnesses.documents import find_witness, rough_bounds
 from noack.theory.witnesses.effort import Effort, NoWitnessError, WorkLimitError
 from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.search import Search
@@ -119,8 +120,10 @@ def test_a_rate_of_a_similar_loop_with_which_nothing_is_found_is_left() -> None:
         bound = {"output": "drift", "from_start": True, "decay": decay}
         near = {"rate": rate, "bounds": [bound]}
         assert bounds_of(find_witness(loop, (), near=[near])) == bounds_of(alone)
-    by_gains = {"rate": 0.1, "gains": {}}
+    by_gains = {"rate": 0.3, "gains": {}}
     assert bounds_of(find_witness(loop, (), near=[by_gains])) == bounds_of(alone)
+    rough = [rough_bounds(loop, ["x"], near, Effort(no_progress)).sizes for near in ([], [by_gains])]
+    assert rough[0] == rough[1]
 
 
 def test_a_small_rate_is_tried_where_larger_ones_have_no_forms() -> None:

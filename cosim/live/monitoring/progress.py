@@ -16,12 +16,14 @@ from rich.progress import (
 )
 from rich.progress import Progress as RichProgress
 
+from cosim.live.monitoring.line_times import LINE_EVERY_S, note_line, until_line_s
 from noack.core.progress import Progress
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.console import SafeConsole
 
-_LINE_EVERY_S = 10.0
-"""Time between two lines about some work, if there is no terminal."""
+_LINE_EVERY_S = LINE_EVERY_S
+_LEAST_WAIT_S = 0.1
+"""Between two looks whether a line is due, of a work whose inner work prints."""
 _shown: list[Event] = []
 """Of the work whose lines are printed, the innermost one last."""
 
@@ -45,35 +47,20 @@ def _bar(
         yield lambda **fields: progress.update(task, **fields)
 
 
-class _SparseLines:
-    """Lines about some work where there is no terminal: at most one every ``_LINE_EVERY_S``."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._began_s = self._printed_s = time.monotonic()
-
-    @property
-    def spent_s(self) -> float:
-        """Time since the work began."""
-        return time.monotonic() - self._began_s
-
-    def print(self, line: str) -> None:
-        """Print a line, unless there is a terminal, or the last line is recent."""
-        now_s = time.monotonic()
-        if not self._console.is_terminal and now_s - self._printed_s >= _LINE_EVERY_S:
-            self._printed_s = now_s
-            print_to_stderr(f"noack: {line}")
+def _print_line(line: str) -> None:
+    note_line()
+    print_to_stderr(f"noack: {line}")
 
 
 @contextmanager
 def _line_at_intervals(line: Callable[[], str], *, printed: bool) -> Iterator[None]:
-    """Print a line every ``_LINE_EVERY_S`` while the context lasts, but while there is one within it."""
+    """Print a line whenever one is due while the context lasts, but while there is one within it."""
     has_ended = Event()
 
     def print_lines() -> None:
-        while not has_ended.wait(_LINE_EVERY_S):
-            if _shown[-1:] == [has_ended]:
-                print_to_stderr(f"noack: {line()}")
+        while not has_ended.wait(max(until_line_s(_LINE_EVERY_S), _LEAST_WAIT_S)):
+            if until_line_s(_LINE_EVERY_S) <= 0 and _shown[-1:] == [has_ended]:
+                _print_line(line())
 
     if not printed:
         yield
@@ -159,18 +146,19 @@ def runs_bar(console: Console) -> Iterator[Progress]:
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
-    sparse_lines = _SparseLines(console)
     before: float | None = None
+    began_s = time.monotonic()
     with _bar(console, 1, *columns) as show:
 
         def update(done: float, total: float = 1.0, /) -> None:
             nonlocal before
             before = done if before is None else before
-            spent_s = sparse_lines.spent_s
+            spent_s = time.monotonic() - began_s
             rate = (done - before) / max(spent_s, 1e-3)
             text = f"{rate:,.0f}/s" if done > before else "starting"
             show(completed=done, total=total, rate=text)
-            sparse_lines.print(f"{done:,.0f} of {total:,.0f} runs after {spent_s:.0f} s")
+            if not console.is_terminal and until_line_s(_LINE_EVERY_S) <= 0:
+                _print_line(f"{done:,.0f} of {total:,.0f} runs after {spent_s:.0f} s")
 
         yield update
 

@@ -1,13 +1,13 @@
 """The terminal follows a run: a progress bar, and lines about what happens."""
 
 import math
-import time
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from cosim.live.coordination.remote_access import ListenSettings
+from cosim.live.monitoring.line_times import LINE_EVERY_S, note_line, until_line_s
 from cosim.live.monitoring.run_observers import RunObserver
 from noack.runtime.address import address_text
 from noack.runtime.control_messages import RunProgress
@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""
-_LINE_EVERY_S = 10.0
-"""Wall time between two of them where there is no terminal."""
+_LINE_EVERY_S = LINE_EVERY_S
 
 
 class RunTerminal(RunObserver):
@@ -33,7 +32,7 @@ class RunTerminal(RunObserver):
     def __init__(self, scenario: Scenario, console: "Console | None" = None) -> None:
         self._scenario, self._given_console = scenario, console
         self._task: TaskID | None = None
-        self._plain_lines, self._printed_s = 0, time.monotonic()
+        self._plain_lines = 0
         self._lines: dict[str, int] = {}
         """How many lines of a list have been shown, by field."""
 
@@ -76,8 +75,8 @@ class RunTerminal(RunObserver):
         if self._console.is_dumb_terminal and due > self._plain_lines:
             self._plain_lines = due
             self._print(text)
-        if not self._console.is_terminal and time.monotonic() - self._printed_s >= _LINE_EVERY_S:
-            self._printed_s = time.monotonic()
+        if not self._console.is_terminal and until_line_s(_LINE_EVERY_S) <= 0:
+            note_line()
             self._print(f"noack: {text}")
 
     def stopping(self, why: str) -> None:

@@ -82,6 +82,9 @@ _INPUT_WEIGHTS = (1.0, 10.0, 100.0)
 """r of the regulators that are tried: with a larger one the gain is slower."""
 _FRICTION_INPUT_WEIGHTS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4)
 """The same with allowed errors and friction, which keeps an output off by its size over the gain."""
+_USUAL_INPUT = 20.0
+"""The largest entry of a column of B for which these r hold. With another one r is such that the loop is the
+same: the unit of an input does not matter."""
 _STICKING_SHARE = 0.25
 """Of an allowed error, friction takes at most this, if a gain is stiff enough."""
 _SIZE_STEPS, _SIZE_TIME_CONSTANTS, _LEAST_SIZE = 400, 5.0, 1e-3
@@ -226,14 +229,14 @@ def new(
     errors = _allowed(model, allowed)
     x0 = _initial_state(model, fixed_state)
     if plant_model is model:
-        first = gain(model, q=_state_weights(model, errors))
+        first = gain(model, q=_state_weights(model, errors), r=_input_weights(model, 1.0))
         plant_model = model = beside_steps(model, _sizes(first, x0))
     trials = _TrialScenarios(model, Path(path), fixed, errors)
     best = trials.search([*_list_trials(plant_model, x0, errors)], report)
     report("simulating")
     returns = trials.returns(best)
     for _ in range(_MOST_REDUCTIONS):
-        if returns or fixed_state is not None:
+        if returns or fixed_state is not None or model.plant.initial_state is not None:
             break
         best = replace(best, x0=best.x0 * _START_FACTOR)
         returns = trials.returns(best)
@@ -323,10 +326,11 @@ def _list_trials(
         gains = [model]
     else:
         q = _state_weights(model, allowed)
-        input_weights = _FRICTION_INPUT_WEIGHTS if allowed and has_friction else _INPUT_WEIGHTS
-        gains = [gain(model, q=q, r=r) for r in input_weights]
         if allowed and has_friction:
+            gains = [gain(model, q=q, r=_input_weights(model, r)) for r in _FRICTION_INPUT_WEIGHTS]
             gains = [each for each in gains if _sticks_within(each, x0, allowed)] or gains[-1:]
+        else:
+            gains = [gain(model, q=q, r=r) for r in _INPUT_WEIGHTS]
     is_tried, slowest_per_s = False, 0.0
     for loop_gain in gains:
         fastest = max(
@@ -361,6 +365,12 @@ def _state_weights(model: LinearModel, allowed: Mapping[str, float]) -> list[flo
     """Return the weights of the states in the regulator; None: all are 1."""
     names = model.plant.state_names
     return [1.0 if name in allowed else _OTHER_WEIGHT for name in names] if allowed else None
+
+
+def _input_weights(model: LinearModel, r: float) -> list[float]:
+    """Return the weights of the inputs in the regulator, (m,), for one that has the usual effect."""
+    effects = np.abs(model.B).max(axis=0)
+    return [to_digits(r * (effect / _USUAL_INPUT) ** 2) if effect else r for effect in effects.tolist()]
 
 
 def _sizes(loop: LoopGain, x0: Vector) -> Vector:

@@ -324,7 +324,7 @@ class _Rates:
         """Return the shares that outputs have in the first document with them, of those with the same r."""
         found: Shares = {}
         for document in documents:
-            bounds = document["bounds"] if document["rate"] == self.rate else ()
+            bounds = document.get("bounds", ()) if document["rate"] == self.rate else ()  # none by gains
             assert isinstance(bounds, Sequence)
             for bound in bounds:
                 share = (bound["decay"] / 2 - self.rate) / (self.slowest - self.rate)

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 
 import pytest
 
-from cosim.live.monitoring import progress
+from cosim.live.monitoring import line_times, progress
 
 MOST_S = 60.0
 
@@ -29,6 +29,22 @@ def test_long_work_is_not_silent_though_it_reports_nothing(
             time.sleep(0.01)
             printed += capsys.readouterr().err
     assert printed.startswith("noack: proving")
+
+
+def test_short_works_that_follow_each_other_are_not_silent_for_long(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The last line was long ago, when this work begins."""
+    monkeypatch.setattr(progress, "_LINE_EVERY_S", 1000.0)
+    monkeypatch.setattr(line_times, "_last_s", time.monotonic() - 1000.0)
+    printed, ends_s = "", time.monotonic() + MOST_S
+    with progress.activity("checking"):
+        while "\n" not in printed and time.monotonic() < ends_s:
+            time.sleep(0.01)
+            printed += capsys.readouterr().err
+        time.sleep(0.3)
+        printed += capsys.readouterr().err
+    assert printed.count("\n") == 1
 
 
 def test_the_share_is_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -227,6 +227,22 @@ def test_dry_friction_is_left_out_of_the_model_and_kept_in_the_guarantee() -> No
         assert np.abs(np.array(rows["angle"])[late]).max() <= 0.02
 
 
+@pytest.mark.parametrize(("effect", "unit"), [(2.5, 1.0), (0.02, 1000.0)])
+def test_units_of_inputs_and_states_do_not_matter(effect: float, unit: float) -> None:
+    """A torque in N m, or degrees and a current in mA, instead of a voltage with effect 20 and radians."""
+    (code,) = blocks("README.md", "python")
+    code = code.replace("20.0 * u[0]", f"{effect} * {unit} * u[0]").replace(
+        "0.5 * math", f"{0.5 * unit} * math"
+    )
+    code = code.replace("rate / 0.05", f"rate / {0.05 * unit}").replace("1.0, 0.0]", f"{unit}, 0.0]")
+    Path("servo.py").write_text(code.replace("0.02}", f"{0.02 * unit}}}"))
+    made = noack.new("servo.py", "servo.toml")
+    assert made.gain.model.A[1, 1] == pytest.approx(-4.0, rel=1e-3)
+    assert made.gain.decay_per_s == pytest.approx(9.75, rel=0.01)
+    start = re.escape(f"angle stays within {0.02 * unit:g} rad of its set-point from ")
+    assert re.fullmatch(rf"{start}2\.\d+ s on, although up to 4 .* \(proved\)", made.guarantee)
+
+
 def test_friction_that_jumps_is_refused_with_what_to_write_instead() -> None:
     (code,) = blocks("README.md", "python")
     code = code.replace("import math", "import numpy as np").replace(
