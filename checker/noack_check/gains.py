@@ -586,7 +586,8 @@ def _unbounded(rows: Mapping[str, Form]) -> RejectedError:
     if not 1 <= radius < math.inf:
         return RejectedError("gains: the inequalities between the suprema are not solved")
     return RejectedError(
-        f"gains: what losses and delays add to the errors returns {radius:.4g} times as large, not below 1"
+        "gains: what losses and delays add to an error comes back through the loop "
+        f"{radius:.4g} times as large; a proof needs less than 1"
     )
 
 

@@ -17,7 +17,7 @@ from typer.core import TyperGroup
 from typer.main import get_command_name, get_group
 
 from cosim.cli.options import PANELS, examples
-from cosim.live.monitoring.line_times import note_line
+from cosim.live.monitoring.line_times import lines_of_command
 from noack.core.errors import CallerError, ExitStatus, NoackError, plain_mistake, printable, why
 from noack.core.extension_points import missing_extension, parts
 from noack.core.system_processes import exhausted_limit
@@ -54,10 +54,10 @@ class Program(TyperGroup):
     ) -> Any:
         """Run the program; the arguments are those of :class:`typer.core.TyperGroup`."""
         words = self._words = list(sys.argv[1:] if args is None else args)
-        note_line()
         try:
             _refuse_empty(words)
-            status = super().main(words, prog_name, complete_var, False, windows_expand_args, **extra)
+            with lines_of_command():
+                status = super().main(words, prog_name, complete_var, False, windows_expand_args, **extra)
         except typer.TyperException as error:
             status = ExitStatus.CALLER
             if line := self._line(error):

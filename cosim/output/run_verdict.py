@@ -347,7 +347,7 @@ def _certified_times(loop: LoopSummary) -> str:
         return ""
     names = [name for name in _TIMES if getattr(loop.certified_for, name) > getattr(loop.allowed, name)]
     times = [_TIMES[name].format(duration_at_least(getattr(loop.certified_for, name))) for name in names]
-    return f"certified for {', '.join(times)}"
+    return f"certified for {', '.join(times)}, as late as this run was"
 
 
 def _end_of_certificates(loop: LoopSummary) -> str:

@@ -1,22 +1,44 @@
-"""When a command printed its last line about its work, where there is no terminal.
+"""When the last line about work was printed, where there is no terminal.
 
 The works of a command follow each other: the time until the next line counts from the last line of any of
-them, or from the start, so that no wait without a line is longer.
+them, or from the command's start, so that no wait without a line is longer. Elsewhere, as in a program that
+uses the library, it counts from the begin of the work.
 """
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 LINE_EVERY_S = 9.0
-"""Time between two lines; the imports before this one take some tenths of a second, too."""
+"""Time between two lines; the imports before a command's start take some tenths of a second, too."""
 _last_s = time.monotonic()
+_is_command = False
 
 
-def until_line_s(every_s: float) -> float:
-    """Return the time in s until a line is due; at most 0: it is due."""
-    return every_s - (time.monotonic() - _last_s)
+@contextmanager
+def lines_of_command() -> Iterator[None]:
+    """Count from the begin of this context while it lasts."""
+    global _is_command
+    _is_command = True
+    note_line()
+    try:
+        yield
+    finally:
+        _is_command = False
+
+
+def begin_work() -> None:
+    """Count from now on, unless a command goes on."""
+    if not _is_command:
+        note_line()
 
 
 def note_line() -> None:
     """Count from now on: a line is printed."""
     global _last_s
     _last_s = time.monotonic()
+
+
+def until_line_s(every_s: float) -> float:
+    """Return the time in s until a line is due; at most 0: it is due."""
+    return every_s - (time.monotonic() - _last_s)

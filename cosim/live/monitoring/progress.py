@@ -16,7 +16,7 @@ from rich.progress import (
 )
 from rich.progress import Progress as RichProgress
 
-from cosim.live.monitoring.line_times import LINE_EVERY_S, note_line, until_line_s
+from cosim.live.monitoring.line_times import LINE_EVERY_S, begin_work, note_line, until_line_s
 from noack.core.progress import Progress
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.console import SafeConsole
@@ -65,6 +65,7 @@ def _line_at_intervals(line: Callable[[], str], *, printed: bool) -> Iterator[No
     if not printed:
         yield
         return
+    begin_work()
     _shown.append(has_ended)
     Thread(target=print_lines, daemon=True).start()
     try:
@@ -146,6 +147,7 @@ def runs_bar(console: Console) -> Iterator[Progress]:
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
+    begin_work()
     before: float | None = None
     began_s = time.monotonic()
     with _bar(console, 1, *columns) as show:

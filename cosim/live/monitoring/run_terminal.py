@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from cosim.live.coordination.remote_access import ListenSettings
-from cosim.live.monitoring.line_times import LINE_EVERY_S, note_line, until_line_s
+from cosim.live.monitoring.line_times import LINE_EVERY_S, begin_work, note_line, until_line_s
 from cosim.live.monitoring.run_observers import RunObserver
 from noack.runtime.address import address_text
 from noack.runtime.control_messages import RunProgress
@@ -37,6 +37,7 @@ class RunTerminal(RunObserver):
         """How many lines of a list have been shown, by field."""
 
     def __enter__(self) -> Self:
+        begin_work()
         return self
 
     def __exit__(self, *_: object) -> None:

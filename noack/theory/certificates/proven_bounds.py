@@ -118,5 +118,5 @@ class ProvenBounds(NamedTuple):
         if not self.is_quiet:
             return "after the first input"
         if (self.first_event_s or 0.0) < (self.inter_event_s or 0.0):
-            return "from the second event on"
+            return "except between the first two events"
         return ""

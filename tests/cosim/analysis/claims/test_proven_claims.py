@@ -65,8 +65,8 @@ def test_a_bound_of_the_input_is_compared_where_it_is_the_one_that_acts(record: 
 @pytest.mark.parametrize(
     ("proven", "apart_s", "exception"),
     [
-        (PROVEN, [0.125, 0.25, 0.25], "from the second event on"),
-        (PROVEN._replace(first_event_s=None), [0.0, 0.25, 0.25], "from the second event on"),
+        (PROVEN, [0.125, 0.25, 0.25], "except between the first two events"),
+        (PROVEN._replace(first_event_s=None), [0.0, 0.25, 0.25], "except between the first two events"),
         (PROVEN._replace(first_event_s=0.25), [0.25, 0.25, 0.25], ""),
         (PROVEN._replace(is_quiet=False), [0.0, 0.0, 0.25], "after the first input"),
     ],

@@ -3,7 +3,7 @@
 import re
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 
 import pytest
 
@@ -31,20 +31,22 @@ def test_long_work_is_not_silent_though_it_reports_nothing(
     assert printed.startswith("noack: proving")
 
 
-def test_short_works_that_follow_each_other_are_not_silent_for_long(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("is_command", [True, False])
+def test_short_works_of_a_command_that_follow_each_other_are_not_silent_for_long(
+    is_command: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The last line was long ago, when this work begins."""
+    """The last line was long ago when this work begins; in other programs this does not count."""
     monkeypatch.setattr(progress, "_LINE_EVERY_S", 1000.0)
-    monkeypatch.setattr(line_times, "_last_s", time.monotonic() - 1000.0)
-    printed, ends_s = "", time.monotonic() + MOST_S
-    with progress.activity("checking"):
-        while "\n" not in printed and time.monotonic() < ends_s:
-            time.sleep(0.01)
+    with line_times.lines_of_command() if is_command else nullcontext():
+        monkeypatch.setattr(line_times, "_last_s", time.monotonic() - 1000.0)
+        printed, ends_s = "", time.monotonic() + (MOST_S if is_command else 0.5)
+        with progress.activity("checking"):
+            while "\n" not in printed and time.monotonic() < ends_s:
+                time.sleep(0.01)
+                printed += capsys.readouterr().err
+            time.sleep(0.3)
             printed += capsys.readouterr().err
-        time.sleep(0.3)
-        printed += capsys.readouterr().err
-    assert printed.count("\n") == 1
+    assert printed.count("\n") == is_command
 
 
 def test_the_share_is_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
