@@ -34,6 +34,9 @@ from noack.settings.user_files import NamedFile, file_tables, with_absolute_path
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
 """Rows of numbers or names; the TOML writer puts each entry on its own line."""
+_OF_FILES = ("sha256", "t_s", "x", "u", "samples_s", "intervals_s", "times_ms", "sent_ns", "delays_ns")
+"""What a loaded scenario has beside or instead of a file's name: the hash of a program, the numbers of
+a reference, of delays, of outages, of a recording."""
 MOST_RECORDED_BYTES = 2**28
 """Largest size of a run's scenario file, which includes the losses and delays read from files."""
 
@@ -120,8 +123,10 @@ def completed_with(
         CallerError: one line per mistake, each with file or ``named``, key, value and remedy.
     """
     given = copy.deepcopy(content) if settings else content
-    for key, value in settings:
-        if value is None:
+    for key, value in sorted(settings, key=lambda setting: setting[0].endswith(".sha256")):
+        if (
+            value is None
+        ):  # a hash that is given comes after the file's name, which removes that of the old one
             remove(content, key)
         else:
             put(content, key, value, f"{named}{key}")
@@ -202,7 +207,7 @@ def _with_reference(loop: Scenario, folder: Path, place: str) -> dict[str, Scena
     try:
         check_reference(loop.model_copy(update={"controller": read}))
     except ValueError as error:
-        raise CallerError(f"{place}{error}") from None
+        file.wrong(str(error).removeprefix("controller.reference.0."))
     return {"controller": read}
 
 
@@ -349,7 +354,8 @@ def value_of(text: str, source: str) -> object:
 def put(content: Table, key: str, value: object, source: str) -> None:
     """Set the value of a key such as ``trigger.beta``, which may be short; create missing tables.
 
-    An entry of a list is named by its number: ``network.impairments.0.rate_bps``.
+    With the name of a file, what is there of another one is removed: its hash, or its numbers. An
+    entry of a list is named by its number: ``network.impairments.0.rate_bps``.
 
     Raises:
         CallerError: a part of the key is a value, not a table; a list has no such entry; or the key
@@ -366,6 +372,7 @@ def put(content: Table, key: str, value: object, source: str) -> None:
             entries, number = _list_entry(table, part, f"{source}: {'.'.join(path[:depth])}")
             table = entries[number]
     if isinstance(table, dict):
+        _forget_file(table, last)
         table[last] = copy.deepcopy(value)
     else:
         entries, number = _list_entry(table, last, f"{source}: {'.'.join(path)}")
@@ -382,7 +389,14 @@ def remove(content: Table, key: str) -> None:
         else:
             table = table.get(part) if isinstance(table, dict) else None
     if isinstance(table, dict):
+        _forget_file(table, last)
         table.pop(last, None)
+
+
+def _forget_file(table: Table, key: str) -> None:
+    """Remove what a loaded scenario has of a file, if ``key`` is that of its name."""
+    for read in _OF_FILES if key == "file" else ():
+        table.pop(read, None)
 
 
 def _list_entry(table: object, part: str, source: str) -> tuple[list[object], int]:

@@ -129,7 +129,7 @@ def checked_path(settings: FileSettings, place: str) -> Path:
     if (actual := file.sha256()) != settings.sha256:
         file.wrong(
             f"has changed: its SHA-256 is {actual[:16]}..., "
-            f"that of the run is {(settings.sha256 or 'not given')[:16]}..."
+            f"{place}.sha256 is {(settings.sha256 or 'not given')[:16]}..."
         )
     return file.path
 

@@ -1,5 +1,6 @@
 """Scenarios from files, tables and matrices, and the messages for mistakes."""
 
+from pathlib import Path
 from typing import Any
 
 import control
@@ -28,6 +29,49 @@ def test_a_wrong_setting_gives_one_line(settings: Any, message: str) -> None:
         noack.with_settings(noack.load("lane_following"), settings)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+PLANT = "class Plant:\n    def derivative(self, t, x, u):\n        return [x[1], %s * u[0]]\n"
+
+
+def test_a_changed_file_replaces_what_was_read_from_the_other_one(tmp_path: Path) -> None:
+    """Of a program that is its hash, of data its numbers; a hash that is given is kept."""
+    for name, factor in (("first", 1.0), ("second", 2.0)):
+        (tmp_path / f"{name}.py").write_text(PLANT % factor)
+        (tmp_path / f"{name}.csv").write_text(f"t_s,position,speed,u\n0,{factor},0,0\n9,{factor},0,0\n")
+        (tmp_path / f"{name}.delays").write_text(f"{factor}ms\n5ms\n")
+        (tmp_path / f"{name}.outages").write_text(f"{factor}s 3s\n")
+    first, second = str(tmp_path / "first"), str(tmp_path / "second")
+
+    def settings(path: str) -> dict[str, Any]:
+        return {
+            "horizon_s": 0.1,
+            "plant.system": {"kind": "python", "file": f"{path}.py", "name": "Plant"},
+            "plant.draw": None,
+            "model.state_names": ["position", "speed"],
+            "model.input_names": ["u"],
+            "controller.reference": [{"kind": "file", "file": f"{path}.csv"}],
+            "network.impairments": [
+                {"kind": "delay", "distribution": "empirical", "file": f"{path}.delays"},
+                {"kind": "blackout", "file": f"{path}.outages"},
+            ],
+        }
+
+    files = {
+        "plant.system.file": f"{second}.py",
+        "controller.reference.0.file": f"{second}.csv",
+        "network.impairments.0.file": f"{second}.delays",
+        "network.impairments.1.file": f"{second}.outages",
+    }
+    loaded = noack.load("double_integrator", settings(first))
+    changed = noack.with_settings(loaded, files)
+    assert changed == noack.load("double_integrator", settings(second)) != loaded
+    assert noack.simulate(changed).summary
+    entry_point = {"plant.system.file": None, "plant.system.name": "package.module:Plant"}
+    assert "sha256" not in noack.with_settings(loaded, entry_point).plant.system.content()
+    known = {"plant.system.sha256": loaded.plant.system.content()["sha256"], **files}
+    with pytest.raises(noack.NoackError, match=r"has changed: its SHA-256 is .*, plant.system.sha256 is "):
+        noack.simulate(noack.with_settings(loaded, known))
 
 
 def test_a_system_becomes_a_scenario_with_the_documented_choices() -> None:
