@@ -20,7 +20,7 @@ from cosim.output.figures.axes_parts import (
     rgb,
     whole_numbers,
 )
-from cosim.output.figures.page_figure import PAPER, PageFigure, one_panel
+from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.figures.palette import CONTROLLER, SENSOR, THRESHOLD, Colour
 from cosim.output.figures.panels import Panels
 from cosim.record.align import Reals
@@ -56,7 +56,7 @@ def _times_figure(
                 counted.axhline(
                     bound.values.min(), color=rgb(style.colour), linewidth=1.6, dashes=style.dash or (1, 0)
                 )
-        draw_marks(axes, t_s, values, colour, markeredgecolor=PAPER, markeredgewidth=0.5)
+        draw_marks(axes, t_s, values, colour, markeredgewidth=0.0)
         counted.set_xlabel("count")
         counted.tick_params(which="both", labelleft=False)
         whole_numbers(counted, "x")

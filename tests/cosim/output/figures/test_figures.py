@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import matplotlib.image
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -13,7 +14,7 @@ from matplotlib.colors import to_rgb
 import noack
 from cosim.analysis.summary.quantiles import QuantileSketch
 from cosim.output.curves import DASHED, ERRORS, INPUT, STATE_NORM, Curve, CurveStyle, state_curves
-from cosim.output.figures import palette
+from cosim.output.figures import axes_parts, palette
 from cosim.output.figures.figure_files import save_figure, save_figures
 from cosim.output.figures.figure_format import requested_files
 from cosim.output.figures.page_figure import PageFigure, one_panel
@@ -148,6 +149,17 @@ def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: 
         assert b"/Type3" not in content.replace(b" ", b"")  # refused by publishers
     states = run.directory / "report-figures/states.svg"
     assert states.read_text().count('width="720pt"') == 1
+
+
+def test_many_dots_at_one_height_keep_their_colour(tmp_path: Path) -> None:
+    """Each event of a periodic sensor has the same interval: the dots overlap and form a line."""
+    trigger = {"policy": "periodic", "period_s": 0.02}
+    run = noack.simulate(noack.load("double_integrator", {"horizon_s": 6.0, "trigger": trigger}))
+    (path,) = run.save_figures("png", figure="inter-event")
+    pixels = mpl.image.imread(path)[:, :, :3]
+    left = pixels[:, : 2 * pixels.shape[1] // 3]  # without the histogram
+    is_coloured = np.abs(left - axes_parts.rgb(palette.SENSOR)).max(axis=2) < 0.1
+    assert is_coloured.mean(axis=1).max() > 0.7
 
 
 def test_outputs_share_the_axis_of_time_and_their_zeros_do_not_stretch_the_others() -> None:
