@@ -10,7 +10,7 @@ from pydantic import model_validator
 
 from noack.controllers.controller_settings import ControllerSettings, ControlModel
 from noack.controllers.linear_feedback import LinearFeedback
-from noack.settings.section import MatrixRows, require_shape, shape
+from noack.settings.section import MatrixRows, require_shape
 
 
 class StateSpaceSettings(ControllerSettings):
@@ -39,11 +39,6 @@ class StateSpaceSettings(ControllerSettings):
             raise ValueError(f"{missing[0]}: give the matrices A, B and C, or a file of them")
         k = len(self.A)
         require_shape(self.A, "A", (k, k), "the controller's matrix A is square")
-        for key, (height, width), reason in (
-            ("B", (k, shape(self.B, "B")[1]), "one row per state of the controller"),
-            ("C", (shape(self.C, "C")[0], k), "one column per state of the controller"),
-        ):
-            require_shape(getattr(self, key), key, (height, width), reason)
         return self
 
     @property

@@ -64,8 +64,8 @@ class FilePiece(PieceSettings):
         update = {"t_s": tuple(numbers[:, 0].tolist()), "file": None}
         return self.model_copy(update=update | {"x": rows_of(numbers[:, 1:n]), "u": rows_of(numbers[:, n:])})
 
-    def check(self, A: Matrix, B: Matrix, horizon_s: float) -> None:
-        """Raise ValueError unless the numbers are a solution of ẋ = Ax + Bu."""
+    def check(self, A: Matrix, B: Matrix, horizon_s: float, states: Sequence[str]) -> None:
+        """Raise ValueError unless the numbers are a solution of ẋ = Ax + Bu; ``states`` names those of x."""
         assert self.t_s is not None
         assert self.x is not None
         assert self.u is not None
@@ -82,9 +82,9 @@ class FilePiece(PieceSettings):
                 f"{TIME}: expected ascending times from 0 to the horizon, {horizon_s:g} s, at least "
                 f"1 us apart; found {found}"
             )
-        self._require_solution(A, B)
+        self._require_solution(A, B, states)
 
-    def _require_solution(self, A: Matrix, B: Matrix) -> None:
+    def _require_solution(self, A: Matrix, B: Matrix, states: Sequence[str]) -> None:
         """Compare each row, and the curve half-way to it, with the solution from the row before."""
         n, x, u = len(A), np.array(self.x), np.array(self.u)
         scale = np.maximum(np.abs(x).max(axis=0), np.finfo(float).tiny)
@@ -100,14 +100,14 @@ class FilePiece(PieceSettings):
             curve = half_s ** np.arange(4) @ segment.polynomial[:, :n]
             with np.errstate(over="ignore", invalid="ignore"):
                 errors = [steps[length_ns][0] @ start - x[row + 1], steps[length_ns][1] @ start - curve]
-            for error, place in zip(errors, ("row", "the curve half-way to row"), strict=True):
+            for error, place in zip(errors, ("", "the curve half-way to "), strict=True):
                 if not (np.abs(error) <= self.tolerance * scale).all():
                     worst = int(np.argmax(np.abs(error) / scale))
                     allowed = self.tolerance * scale[worst]
                     at_s = end_ns / NS_PER_S
                     raise ValueError(
-                        f"t_s: not a solution of the model: {place} {row + 2}, t = {at_s:g} s, is off by "
-                        f"{abs(error[worst]):.3g} in state {worst + 1}; tolerance allows {allowed:.3g}"
+                        f"x: not a solution of the model: in {place}row {row + 2}, t = {at_s:g} s, "
+                        f"{states[worst]} is off by {abs(error[worst]):.3g}; tolerance allows {allowed:.3g}"
                     )
 
     def segments(self, A: Matrix, B: Matrix) -> list[ReferenceSegment]:

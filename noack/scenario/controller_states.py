@@ -43,8 +43,13 @@ def check_controller_states(scenario: ScenarioTables) -> None:
     if not isinstance(controller, StateSpaceSettings):
         return
     (n, m), k = scenario.model.dimensions, controller.states
-    require_shape(controller.B, "controller.B", (k, n), "one column per state of the model")
-    require_shape(controller.C, "controller.C", (m, k), "one row per input")
+    require_shape(
+        controller.B,
+        "controller.B",
+        (k, n),
+        "as many rows as controller.A, one column per state of the model",
+    )
+    require_shape(controller.C, "controller.C", (m, k), "one row per input, as many columns as controller.A")
     require_shape(
         controller.D, "controller.D", (m, n), "one row per input, one column per state of the model"
     )

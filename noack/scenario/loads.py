@@ -263,10 +263,7 @@ def loaded_observer(resolved: ScenarioTables) -> AnyObserver:
     period_ns = float(resolved.timing.measurement_period.exact)
     step = transition(A, period_ns)
     if unobservable_mode(step, C) is not None:
-        raise CallerError(
-            "model.load: the observer cannot tell the loads apart from what plant.measurement.C measures; "
-            f"measure more, or take fewer loads than {model.loads}"
-        )
+        raise CallerError(f"model.load: {_not_estimated(step, C, n)}")
     if observer is None:
         observer = LuenbergerSettings(kind="luenberger", gain=rows_of(_usual_gain(resolved, step, C)))
     elif observer.initial_estimate is not None and len(observer.initial_estimate) == n:
@@ -279,6 +276,27 @@ def loaded_observer(resolved: ScenarioTables) -> AnyObserver:
         first[:n] = np.linalg.pinv(C[:, :n])
         observer = observer.model_copy(update={"first_gain": rows_of(first)})
     return observer
+
+
+def _not_estimated(step: Matrix, C: Matrix, n: int) -> str:
+    """Return why no observer estimates the loads, which are the states after the first n, and what to do."""
+    if unobservable_mode(step[:n, :n], C[:, :n]) is not None:
+        return (
+            "plant.measurement.C does not determine the model's states, so no load can be estimated; "
+            "measure more states, or leave model.load out"
+        )
+    alone = [np.ix_([*range(n), load], [*range(n), load]) for load in range(n, len(step))]
+    if all(unobservable_mode(step[each], C[:, each[1][0]]) is not None for each in alone):
+        which = "this load" if len(alone) == 1 else "none of these loads"
+        can = "cannot" if len(alone) == 1 else "can"
+        return (
+            f"{which} {can} be estimated from what plant.measurement.C measures; measure more states, "
+            "or leave model.load out"
+        )
+    return (
+        "the observer cannot tell the loads apart from what plant.measurement.C measures; "
+        f"measure more states, or take fewer loads than {len(alone)}"
+    )
 
 
 def _usual_gain(resolved: ScenarioTables, step: Matrix, C: Matrix) -> Matrix:

@@ -82,7 +82,7 @@ def reference_segments(
         pieces: at least one; that of a file which has not been read has no segments.
         A: Â, (n, n).
         B: B̂, (n, m).
-        rows: c of each output y = c x, (n,), by its name.
+        rows: c of each output y = c x, (n,), by its name; the first n are the states.
         horizon_s: length of the run.
 
     Raises:
@@ -93,7 +93,7 @@ def reference_segments(
     if others and not all(isinstance(piece, OutputPiece) for piece in pieces):
         raise PieceError(0, f"kind: {first.kind} and {others[0]} do not go together")
     if isinstance(first, FilePiece):
-        return _of_file(pieces, first, A, B, horizon_s)
+        return _of_file(pieces, first, A, B, horizon_s, [*rows][: len(A)])
     if isinstance(first, SolutionSegment):
         return _given_segments(pieces, A, B, horizon_s)
     timelines = _timelines(pieces, rows, A, B)
@@ -110,14 +110,15 @@ def reference_segments(
 
 
 def _of_file(
-    pieces: Sequence[PieceSettings], piece: FilePiece, A: Matrix, B: Matrix, horizon_s: float
-) -> list[ReferenceSegment]:
+    pieces: Sequence[PieceSettings], piece: FilePiece, A: Matrix, B: Matrix, horizon_s: float,
+    states: Sequence[str],
+) -> list[ReferenceSegment]:  # fmt: skip
     if len(pieces) > 1:
         raise PieceError(1, "kind: one file is a whole reference")
     if piece.file is not None:
         return []  # its numbers are checked when it has been read
     try:
-        piece.check(A, B, horizon_s)
+        piece.check(A, B, horizon_s, states)
     except ValueError as error:
         raise PieceError(0, str(error)) from None
     return piece.segments(A, B)

@@ -411,9 +411,11 @@ class TheoryCoverage:
         """Raise CallerError if the settings change, or the set point is not 0."""
         self.require_constant()
         if self.scenario.controller.reference is not None:
-            raise CallerError("controller.reference: this needs x_r = 0; leave the reference out")
+            raise CallerError("controller.reference: this needs x_r = 0; leave controller.reference out")
         if any(self.scenario.controller.setpoint or ()):
-            raise CallerError("controller.setpoint: this needs the set point 0")
+            raise CallerError(
+                "controller.setpoint: this needs the set point 0; leave controller.setpoint out"
+            )
 
     def require_direct_inputs(self) -> None:
         """Raise CallerError unless every actuation reaches the plant and carries one input."""

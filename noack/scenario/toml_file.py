@@ -301,7 +301,7 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
     if kind == "string_pattern_mismatch" and mistake["ctx"]["pattern"] in _PATTERNS:
         return f"{assignment}: {_PATTERNS[mistake['ctx']['pattern']]}"
     if kind == "tuple_type":
-        return f"{assignment}: {_LISTS.get(_entry_of(place), 'expected a list of tables')}"
+        return f"{assignment}: {_LISTS.get(_entry_of(place)) or _list_of_tables(value, place)}"
     message = plain_mistake(mistake["msg"])
     message = message[0].lower() + message[1:]
     if isinstance(value, str) and _WITH_UNIT.fullmatch(value) and message.endswith("number"):
@@ -357,6 +357,21 @@ def _entry_of(place: _Place) -> Kind:
         return tuple
     entry = _alternatives(get_args(lists[0])[0])[0]
     return get_origin(entry) or entry
+
+
+def _list_of_tables(value: object, place: _Place) -> str:
+    """Say that a list of tables is expected; of a table that is given, how it is written as one."""
+    lists = [alternative for alternative in _alternatives(place.kind) if get_origin(alternative) is tuple]
+    choices, key = _choices(get_args(lists[0])[0])
+    if not isinstance(value, Mapping):
+        example = _table_example(value, place._replace(choices=choices, discriminator=key)) if choices else ""
+        return "expected a list of tables" + example.replace("e.g. {", "such as [{").replace("}", "}]")
+    fitting = [kind for kind, section in choices.items() if value.keys() <= section.model_fields.keys()]
+    kind = {key: fitting[0]} if len(fitting) == 1 else {}
+    entries = ", ".join(f"{name} = {show_value(entry)}" for name, entry in (kind | dict(value)).items())
+    in_list = any(isinstance(part, int) for part in place.path)
+    header = "" if in_list else f"[[{'.'.join(map(str, place.path))}]], or "
+    return f"expected a list of tables: write {header}[{{ {entries} }}]"
 
 
 def _share(value: object, place: _Place) -> str:

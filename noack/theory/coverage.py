@@ -40,18 +40,23 @@ def _of_nonlinear_loops(scenario: Scenario) -> Iterator[str]:
         yield f"model.load_states = {scenario.model.load_states}: a constant load does not decay"
 
 
-def _of_disturbed_loops(scenario: Scenario) -> Iterator[str]:
+def _of_disturbed_loops(scenario: Scenario) -> Iterator[tuple[str, str]]:
+    """Yield what exact simulation has none of, and what to leave out."""
     plant, network = scenario.plant, scenario.network
     if plant.disturbances:
-        yield f'plant.disturbances.kind = "{plant.disturbances[0].kind}": the plant is disturbed'
+        kind = plant.disturbances[0].kind
+        yield f'plant.disturbances.kind = "{kind}": the plant is disturbed', "plant.disturbances"
     if plant.measurement.is_noisy:
-        yield "plant.measurement: the state is measured with noise"
+        yield "plant.measurement: the state is measured with noise", "the noise"
     if scenario.observer is not None:
-        yield f'observer.kind = "{scenario.observer.kind}": the state is estimated'
+        yield f'observer.kind = "{scenario.observer.kind}": the state is estimated', "observer"
     if network.actuation is not None:
-        yield "network.actuation: actuations may be lost or late"
+        yield "network.actuation: actuations may be lost or late", "network.actuation"
     if scenario.controller.reference is not None:
-        yield "controller.reference: the loop follows a reference that changes over time"
+        yield (
+            "controller.reference: the loop follows a reference that changes over time",
+            "controller.reference",
+        )
 
 
 @cached_method
@@ -79,8 +84,10 @@ def require_linear(scenario: Scenario) -> None:
 
 def require_exact(scenario: Scenario) -> None:
     """Raise CallerError if exact simulation does not cover a scenario."""
-    if (reason := nonlinear_because(scenario) or next(_of_disturbed_loops(scenario), None)) is not None:
+    if (reason := nonlinear_because(scenario)) is not None:
         raise CallerError(
             f"{reason}; this needs a linear plant with u = K x_c and a trigger rule of noack, without "
             "acknowledgements, lost actuations, disturbances, noise and observer"
         )
+    for reason, cause in _of_disturbed_loops(scenario):
+        raise CallerError(f"{reason}; this needs a loop without it: leave {cause} out")

@@ -183,8 +183,9 @@ def test_the_checker_reads_it_with_an_observer_about_a_reference() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"controller.B": [[1.0]]}, "expected 1 x 2 (one column per state of the model)"),
-        ({"controller.C": [[1.0], [1.0]]}, "expected 1 x 1 (one row per input)"),
+        ({"controller.B": [[1.0]]}, "as controller.A, one column per state of the model), found 1 x 1"),
+        ({"controller.B": [[1.0] * 3] * 3}, "expected 1 x 2 (as many rows as controller.A, one column"),
+        ({"controller.C": [[1.0], [1.0]]}, "expected 1 x 1 (one row per input, as many columns"),
         ({"controller.D": [[1.0]]}, "expected 1 x 2 (one row per input, one column"),
         ({"controller.A": [[0.0, 1.0]]}, "the controller's matrix A is square"),
         ({"controller.A": None}, "give the matrices A, B and C"),

@@ -198,11 +198,25 @@ def test_a_mistake_is_explained_in_one_line(tables: dict[str, Table], message: s
     assert "\n" not in str(raised.value)
 
 
-def test_loads_that_the_measurement_cannot_tell_apart_are_refused() -> None:
-    """Two loads on a mass of which one state is measured: only their effect together is seen."""
-    scenario = mass(
-        model={"load": [[1.0, 0.0], [0.0, 1.0]], "hold": ["position"]},
-        plant={"measurement": {"C": [[1.0, 0.0]]}},
-    )
-    with pytest.raises(CallerError, match="cannot tell the loads apart"):
-        resolve(scenario)
+SPRING = {"A": [[0.0, 1.0], [-1.0, -1.0]], "B": [[0.0], [1.0]], "gain": [[-1.0, -1.0]]}
+
+
+@pytest.mark.parametrize(
+    ("model", "C", "message"),
+    [
+        # A constant force on a mass at a spring: only its position moves in the long run.
+        ({**SPRING, "load": "input"}, [[0.0, 1.0]], "this load cannot be estimated from what"),
+        ({**SPRING, "load": [[0.0, 0.0], [1.0, 2.0]], "hold": ["position"]}, [[0.0, 1.0]],
+         "none of these loads can be estimated from what"),
+        # Two loads on a mass: only their effect together is seen.
+        ({"load": [[1.0, 0.0], [0.0, 1.0]], "hold": ["position"]}, [[1.0, 0.0]],
+         "cannot tell the loads apart from what .*; measure more states, or take fewer loads than 2"),
+        ({"load": "input"}, [[0.0, 1.0]], "C does not determine the model's states, so no load can be"),
+    ],
+)  # fmt: skip
+def test_a_load_that_no_observer_can_estimate_is_refused(
+    model: dict[str, object], C: list[list[float]], message: str
+) -> None:
+    with pytest.raises(CallerError, match=rf"^model\.load: .*{message}") as refused:
+        resolve(mass(model=model, plant={"measurement": {"C": C}}))
+    assert "\n" not in str(refused.value)

@@ -74,7 +74,7 @@ def mistakes_with(text: str, folder: Path, settings: Sequence[str]) -> list[str]
     return str(caught.value).replace(str(path), "FILE").split("\n")
 
 
-_SUGGESTED = re.compile(r"(?:try|e\.g\.|% is) (\[.*\]|[\d.]+)$")
+_SUGGESTED = re.compile(r"(?:try|e\.g\.|% is|, or) (\[.*\]|[\d.]+)$")
 
 
 def test_the_lines_about_mistakes_are_those_that_were_approved(tmp_path: Path) -> None:

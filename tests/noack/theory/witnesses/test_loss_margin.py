@@ -143,13 +143,24 @@ def test_the_margin_does_not_depend_on_the_unit_of_the_input() -> None:
         assert stability.upper == pytest.approx(expected.upper, rel=1e-3)
 
 
-@pytest.mark.parametrize(("gain", "verdict"), [(29.89, "stable"), (29.894, "destabilised")])
-def test_a_delay_of_ten_periods_has_the_known_limit(gain: float, verdict: str) -> None:
+@pytest.mark.parametrize(
+    ("gain", "delay_s", "phase", "verdict"),
+    [
+        (29.89, 0.045, 0.5, "stable"), (29.894, 0.045, 0.5, "destabilised"),
+        # Until the tick after the arrival, then until the plant's next step.
+        (29.0, 0.047, 0.5, "stable"), (29.0, 0.048, 0.5, "destabilised"),
+        (29.0, 0.046, 0.2, "stable"), (29.0, 0.047, 0.2, "destabilised"),
+        (29.0, 0.05, 0.0, "destabilised"),
+    ],
+)  # fmt: skip
+def test_a_delay_of_ten_periods_has_the_known_limit(
+    gain: float, delay_s: float, phase: float, verdict: str
+) -> None:
     """x⁺ = x − kh x ten steps before is stable for k below 2 sin(π / 42) / h = 29.892 per second."""
     settings = (
         "mode=zoh", "model={A=[[0.0]], B=[[1.0]], gain=[[%r]]}" % -gain, "network.mansd=0", "horizon_s=6",
         "plant={initial_state=[1.0], rate_hz=200.0}", "controller.rate_hz=200",
-        'trigger={policy="periodic", period_s=0.005}', late(0.045),
+        f"controller.phase={phase}", 'trigger={policy="periodic", period_s=0.005}', late(delay_s),
     )  # fmt: skip
     assert LossMargin(scenario("double_integrator", *settings)).stability().verdict == verdict
 
