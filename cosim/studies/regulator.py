@@ -12,12 +12,8 @@ def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
     """
     from scipy.linalg import solve_continuous_are  # importing scipy takes 0.2 s
 
-    # In units of the inputs in which R has ones on its diagonal: the solver needs inputs of a usual size.
-    sizes = np.diagonal(R)
-    units = np.where(sizes > 0, np.abs(sizes), 1.0) ** -0.5
-    B_scaled, R_scaled = B * units, R * np.outer(units, units)
-    P = solve_continuous_are(A, B_scaled, Q, R_scaled)
-    K = units[:, None] * np.asarray(-np.linalg.solve(R_scaled, B_scaled.T @ P), dtype=np.float64)
+    P = solve_continuous_are(A, B, Q, R)
+    K = np.asarray(-np.linalg.solve(R, B.T @ P), dtype=np.float64)
     if not spectral_abscissa(A + B @ K) < 0:
         raise np.linalg.LinAlgError("it does not make the loop stable")
     return K

@@ -85,6 +85,8 @@ _FRICTION_INPUT_WEIGHTS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4)
 _USUAL_INPUT = 20.0
 """The largest entry of a column of B for which these r hold. With another one r is such that the loop is the
 same: the unit of an input does not matter."""
+_LEAST_EFFECT = 1e-6
+"""Smaller effects, relative to the usual one, count as this one: the Riccati equation is not solved beyond."""
 _STICKING_SHARE = 0.25
 """Of an allowed error, friction takes at most this, if a gain is stiff enough."""
 _SIZE_STEPS, _SIZE_TIME_CONSTANTS, _LEAST_SIZE = 400, 5.0, 1e-3
@@ -369,8 +371,8 @@ def _state_weights(model: LinearModel, allowed: Mapping[str, float]) -> list[flo
 
 def _input_weights(model: LinearModel, r: float) -> list[float]:
     """Return the weights of the inputs in the regulator, (m,), for one that has the usual effect."""
-    effects = np.abs(model.B).max(axis=0)
-    return [to_digits(r * (effect / _USUAL_INPUT) ** 2) if effect else r for effect in effects.tolist()]
+    effects = np.maximum(np.abs(model.B).max(axis=0) / _USUAL_INPUT, _LEAST_EFFECT)
+    return [to_digits(r * effect**2) for effect in effects.tolist()]
 
 
 def _sizes(loop: LoopGain, x0: Vector) -> Vector:

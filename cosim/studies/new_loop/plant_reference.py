@@ -2,7 +2,6 @@
 
 import ast
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 
 from cosim.shipped_files import find_shipped, shipped_names
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, did_you_mean, one_line
+from noack.core.errors import CallerError, did_you_mean, one_line, why
 from noack.core.extension_points import missing_extension
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.linear import LinearSettings
@@ -144,9 +143,11 @@ def _system_table(label: str) -> Table | None:
             return table
     if label.endswith(".py"):
         classes = _classes(Path(label))
-        if len(classes) != 1:
-            hint = " or ".join(f"{label}:{each}" for each in classes) or f"{label}:Class"
-            raise CallerError(f"{label}: which class of it? write {hint}")
+        if not classes:
+            raise CallerError(f"{label}: defines no class; a plant has one with derivative(self, t_s, z, u)")
+        if len(classes) > 1:
+            choices = " or ".join(f"{label}:{each}" for each in classes)
+            raise CallerError(f"{label}: which class of it? write {choices}")
         return {"kind": "python", "file": label, "name": classes[0]}
     if colon and file.endswith(".py"):
         return {"kind": "python", "file": file, "name": name}
@@ -167,18 +168,18 @@ def _positive_rate(key: str, value: object) -> float:
 
 
 def _classes(path: Path) -> list[str]:
-    """Return the names of the classes in a Python file; none if it cannot be read.
+    """Return the names of the classes in a Python file.
 
     Raises:
-        CallerError: it is not Python.
+        CallerError: it cannot be read, or is not Python.
     """
-    with suppress(OSError):
-        try:
-            statements = ast.parse(path.read_bytes(), path.name).body
-        except (SyntaxError, ValueError) as error:
-            raise CallerError(f"{path}: {type(error).__name__}: {one_line(error)}") from None
-        return [statement.name for statement in statements if isinstance(statement, ast.ClassDef)]
-    return []
+    try:
+        statements = ast.parse(path.read_bytes(), path.name).body
+    except OSError as error:
+        raise CallerError(f"{path}: cannot be read: {why(error)}") from None
+    except (SyntaxError, ValueError) as error:
+        raise CallerError(f"{path}: {type(error).__name__}: {one_line(error)}") from None
+    return [statement.name for statement in statements if isinstance(statement, ast.ClassDef)]
 
 
 def _validated_settings(table: object, label: str) -> PlantSettings:

@@ -78,6 +78,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(linearisation, "_SAMPLES", {"derivative": 100, "motion": 10})
     Path("pole.py").write_text(POLE)
+    Path("classless.py").write_text("mass_kg = 1.0\n")
     return tmp_path
 
 
