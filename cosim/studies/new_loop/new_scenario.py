@@ -86,7 +86,7 @@ _USUAL_INPUT = 20.0
 """The largest entry of a column of B for which these r hold. With another one r is such that the loop is the
 same: the unit of an input does not matter."""
 _LEAST_EFFECT = 1e-6
-"""Smaller effects, relative to the usual one, count as this one: the Riccati equation is not solved beyond."""
+"""Smaller effects, relative to the usual one, count as this one: no Riccati equation is solved beyond."""
 _STICKING_SHARE = 0.25
 """Of an allowed error, friction takes at most this, if a gain is stiff enough."""
 _SIZE_STEPS, _SIZE_TIME_CONSTANTS, _LEAST_SIZE = 400, 5.0, 1e-3
