@@ -60,6 +60,8 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
         with user_code(self, _PLACE, CallerError):
             plant, _ = new_instance(self, _PLACE)
             if not hasattr(plant, "states"):
+                if getattr(plant, "allowed", None):
+                    raise ValueError('allowed: of states without names; give states, e.g. ["angle, rad"]')
                 return None
             states = _texts("states", plant.states)
             inputs = _texts("inputs", plant.inputs) if hasattr(plant, "inputs") else None

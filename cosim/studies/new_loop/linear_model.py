@@ -363,7 +363,7 @@ def gain(
     model = replace(model, A=A, B=B)  # of the states and the integrals
     label, uncontrollable = model.plant.label, model.uncontrollable
     if len(uncontrollable) and uncontrollable[0].real >= 0:
-        worst = eigenvalue_text(uncontrollable[:1])
+        worst = eigenvalue_text(uncontrollable[:1].real + 1j * np.abs(uncontrollable[:1].imag))
         raise CallerError(f"{label}: no gain stabilises it: the eigenvalue {worst} /s is not controllable")
     if poles is None:
         Q, R = (_weight_matrix(*weight) for weight in (("q", q, model.A), ("r", r, model.B.T)))

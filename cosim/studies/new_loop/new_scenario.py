@@ -87,6 +87,8 @@ _USUAL_INPUT = 20.0
 same: the unit of an input does not matter."""
 _LEAST_EFFECT = 1e-6
 """Smaller effects, relative to the usual one, count as this one: no Riccati equation is solved beyond."""
+_SMALL_EFFECT = 0.1
+"""With a smaller entry of B, per second, the weights 1 of a state and of an input give a slow loop."""
 _STICKING_SHARE = 0.25
 """Of an allowed error, friction takes at most this, if a gain is stiff enough."""
 _SIZE_STEPS, _SIZE_TIME_CONSTANTS, _LEAST_SIZE = 400, 5.0, 1e-3
@@ -246,6 +248,8 @@ def new(
     guarantee, of_plant = _guarantee(results), results.guaranteed is not None
     certificate = trials.certify(best)
     notes = tuple(_notes(best, certificate, returns, of_plant=of_plant))
+    if not isinstance(plant_model, LoopGain):
+        notes += tuple(_note_of_input(best))
     text = _file_text(trials.content(best), (f"{guarantee}.", *notes), best, fixed)
     found_certificate = certificate if certificate.exists else None
     return NewScenario(best.gain, trials.scenario(best), text, found_certificate, guarantee, notes)
@@ -556,7 +560,8 @@ class _TrialScenarios:
             trial = replace(trial, alpha_per_s=to_digits(_SLOWER * trial.alpha_per_s))
             yield trial
         if self._fixed_settings.keys().isdisjoint(("network", "network.mansd")):
-            yield replace(trial, mansd=trial.mansd // 2)
+            fewer = dict.fromkeys((trial.mansd // 2, 1))
+            yield from (replace(trial, mansd=mansd) for mansd in fewer if 0 < mansd < trial.mansd)
 
     def _proven(self, trial: _Trial) -> Certificates:
         """Return the certificates of a trial, with the bounds that are proven."""
@@ -690,6 +695,17 @@ def _notes(
     start = ", ".join(f"{entry:.3g}" for entry in trial.x0)
     end = "returns to 0" if returns else "does not return to 0"
     yield f"Simulated from x(0) = ({start}), the loop {end}."
+
+
+def _note_of_input(trial: _Trial) -> Iterator[str]:
+    """Yield what to do if the regulator, which weighs inputs like states, hardly uses an input."""
+    effect = float(np.abs(trial.gain.model.B).max(initial=0.0))
+    if not trial.has_friction and 0 < effect < _SMALL_EFFECT:
+        label = trial.gain.model.plant.label
+        yield (
+            f"One unit of an input changes states by at most {effect:.2g} per second, so it is used little. "
+            f"For a faster loop: noack gain {label} --r R --out gain.json, R below 1; noack new gain.json."
+        )
 
 
 _COMMENTS = {

@@ -28,7 +28,7 @@ _OPERATORS = {
     "true_divide": "__truediv__", "power": "__pow__", "float_power": "__pow__", "less": "__lt__",
     "less_equal": "__le__", "greater": "__gt__", "greater_equal": "__ge__",
 }  # fmt: skip
-_KNOWN_FUNCTIONS = f"{', '.join(_FUNCTIONS)}, sqrt, abs, clip, minimum and maximum"
+_KNOWN_FUNCTIONS = f"{', '.join(_FUNCTIONS)}, sqrt, abs, clip, minimum, maximum, radians and degrees"
 
 
 class NotEnclosedError(NoackError):
@@ -158,6 +158,16 @@ class TracedNumber:
         """See :func:`numpy.sqrt`."""
         self._trace.require_root(self)
         return self._step("root")
+
+    def radians(self) -> "TracedNumber":
+        """See :func:`numpy.radians`."""
+        return self * (np.pi / 180)
+
+    def degrees(self) -> "TracedNumber":
+        """See :func:`numpy.degrees`."""
+        return self * (180 / np.pi)
+
+    deg2rad, rad2deg = radians, degrees
 
     def square(self) -> "TracedNumber":
         """See :func:`numpy.square`."""

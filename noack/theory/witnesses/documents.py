@@ -116,7 +116,8 @@ def forms_or_gains(by_forms: Callable[[], Witness], by_gains: Callable[[], Witne
         try:
             return by_gains()
         except NoWitnessError as of_gains:
-            raise type(of_forms)(f"{of_forms}; {of_gains}") from None
+            reasons = dict.fromkeys((str(of_forms), str(of_gains)))
+            raise type(of_forms)("; ".join(reasons)) from None
 
 
 def witness_by_gains(loop: Loop, outputs: Sequence[str]) -> Witness:

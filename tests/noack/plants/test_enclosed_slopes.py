@@ -34,7 +34,8 @@ def chord_slopes(of: Callable[[Any], Any], middle: float, radius: float) -> Any:
         lambda x: x**3 - 2 / x + x**-1.5, lambda x: (1 - x * x) / (x + np.cos(x)),
         lambda x: np.abs(-x) + max(x, 0.0), lambda x: np.array([x, 2 * x]) @ np.array([3.0, x]),
         lambda x: np.clip(x, 0.7, 1.0) + np.maximum(x, 0.8) * np.minimum(x, 1.1),
-        lambda x: x - np.clip(x, 0.7, 1.0),
+        lambda x: x - np.clip(x, 0.7, 1.0), lambda x: np.sin(np.radians(60 * x)) * np.degrees(x),
+        lambda x: np.sin(np.deg2rad(60 * x)) * np.rad2deg(x),
     ],
 )  # fmt: skip
 def test_slopes_of_chords_are_enclosed(of: Callable[[Any], Any]) -> None:

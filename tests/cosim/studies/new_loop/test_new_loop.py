@@ -53,6 +53,27 @@ class Sticking:
     def derivative(self, t_s, z, u):
         return z[1], u[0] - z[1] - math.copysign(0.5, z[1])
 
+class Nameless:
+    allowed = {"position": 0.1}
+
+    def derivative(self, t_s, z, u):
+        return z[1], u[0]
+
+class Swinging:
+    """Nothing moves it."""
+
+    def derivative(self, t_s, z, u):
+        return z[1], 0.0 * u[0] - z[0]
+
+class Heavy:
+    """A force of 1 N hardly moves it."""
+
+    states = ["speed, m/s"]
+    initial_state = [1.0]
+
+    def derivative(self, t_s, z, u):
+        return ((u[0] - 20.0 * z[0]) / 1000.0,)
+
 class Broken:
     def derivative(self, t_s, z, u):
         return nothing
@@ -242,6 +263,14 @@ def test_units_of_inputs_and_states_do_not_matter(effect: float, unit: float) ->
     assert made.gain.decay_per_s == pytest.approx(9.75, rel=0.01)
     start = re.escape(f"angle stays within {0.02 * unit:g} rad of its set-point from ")
     assert re.fullmatch(rf"{start}2\.\d+ s on, although up to 4 .* \(proved\)", made.guarantee)
+
+
+def test_an_input_that_is_used_little_is_said_to_be_so() -> None:
+    hint = "noack gain pole.py:Heavy --r R --out gain.json, R below 1; noack new gain.json."
+    assert noack.new("pole.py:Heavy", "heavy.toml").notes[-1].endswith(hint)
+    faster = noack.gain("pole.py:Heavy", r=1e-4)
+    assert faster.decay_per_s > 0.1
+    assert not noack.new(faster, "faster.toml").notes[-1].endswith(hint)
 
 
 def test_friction_that_jumps_is_refused_with_what_to_write_instead() -> None:
