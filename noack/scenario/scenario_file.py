@@ -123,10 +123,9 @@ def completed_with(
         CallerError: one line per mistake, each with file or ``named``, key, value and remedy.
     """
     given = copy.deepcopy(content) if settings else content
+    # A hash comes after its file's name, which removes that of the old file.
     for key, value in sorted(settings, key=lambda setting: setting[0].endswith(".sha256")):
-        if (
-            value is None
-        ):  # a hash that is given comes after the file's name, which removes that of the old one
+        if value is None:
             remove(content, key)
         else:
             put(content, key, value, f"{named}{key}")
