@@ -17,7 +17,7 @@ from noack.theory.witnesses.templates import Template, Templates
 _CONSTANT_WEIGHT = 100.0
 """Of D₂² of an output."""
 _OF_THRESHOLDS = ("drift", "e_s", "e_c")
-"""What is measured in the thresholds c and f."""
+"""What is measured in the thresholds c and f; not in forms of each test, of which fewer are proven then."""
 FREE = ("c", "eta")
 """Numbers with such names may be negative."""
 _SHORT = "short by/"
@@ -114,7 +114,7 @@ class Search:
         if not starts:
             return {"level 1": 1e-6, "level 2": 1.0}
         level, floor = float(self.model.level), float(self.model.floor)
-        if output in _OF_THRESHOLDS and level and floor:
+        if output in _OF_THRESHOLDS and level and floor and not self.model.is_by_tests:
             return {"level 1": floor / level, "level 2": level / floor}
         return {"level 1": 1.0, "level 2": _CONSTANT_WEIGHT if output.startswith("y[") else 1.0}
 
