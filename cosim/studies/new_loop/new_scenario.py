@@ -516,12 +516,15 @@ class _TrialScenarios:
         A bound that does not decay is proportional to this threshold, where nothing disturbs the plant.
         """
         is_fixed = not self._fixed_settings.keys().isdisjoint(("trigger", "trigger.floor"))
-        trial, results = self._with_proof(trial, report)
+        trial, results = proven = self._with_proof(trial, report)
         for number in range(_MOST_THRESHOLDS):
             if number:
                 report(f"searching for proofs: threshold {number + 1}")
                 results = self._proven(trial)
-            used = results.scenario.trigger
+                if results.guaranteed is None:
+                    trial, results = proven
+                    break
+            proven, used = (trial, results), results.scenario.trigger
             if results.guaranteed is None or is_fixed or not isinstance(used, DecayingSettings):
                 break
             largest = self.largest_share(results)

@@ -10,6 +10,7 @@ from click.testing import Result
 from scipy.linalg import solve_continuous_are
 
 import noack
+from cosim.analysis.certificates import Certificates
 from cosim.studies.new_loop.linear_model import controllable_states
 from cosim.studies.new_loop.new_scenario import _Trial, _TrialScenarios
 from noack.core.errors import CallerError
@@ -226,6 +227,23 @@ def test_one_command_leads_from_a_class_to_a_guarantee_in_its_own_units() -> Non
     smaller = command("new", "servo.py", "--allow", "angle=0.002", "--out", "smaller.toml").stdout
     assert smaller.startswith("angle stays within 0.002 rad")
     assert noack.load("smaller").trigger.floor < scenario.trigger.floor / 5
+
+
+def test_a_guarantee_is_kept_if_nothing_is_proven_with_a_larger_threshold(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    Path("servo.py").write_text(SERVO)
+    prove, tried = _TrialScenarios._proven, list[_Trial]()
+
+    def only_the_first(trials: _TrialScenarios, trial: _Trial) -> Certificates:
+        tried.append(trial)
+        return prove(trials, trial) if len(tried) == 1 else Certificates(trials.scenario(trial))
+
+    monkeypatch.setattr(_TrialScenarios, "_proven", only_the_first)
+    made = noack.new("servo.py", "servo.toml")
+    assert len(tried) == 2
+    assert made.guarantee.startswith("angle stays within 0.144 rad")  # the first proof
+    assert made.scenario.trigger.floor != tried[1].floor
 
 
 def test_dry_friction_is_left_out_of_the_model_and_kept_in_the_guarantee() -> None:
