@@ -160,7 +160,7 @@ def new(
     poles there: `noack gain PLANT --q 10,1 --r 0.1 --out pole.json`. If no certificate is found,
     the scenario is written all the same, with the reason. --set fixes settings.
 
-    Takes some 10 s.
+    Takes some 10 s, and minutes if proofs are hard to find.
     """
     from cosim.studies.new_loop.new_scenario import new as new_scenario
     from cosim.studies.new_loop.new_scenario import require_new_file

@@ -2,7 +2,7 @@
 
 The works of a command follow each other: the time until the next line counts from the last line of any of
 them, or from the command's start, so that no wait without a line is longer. Elsewhere, as in a program that
-uses the library, it counts from the begin of the work.
+uses the library, it counts from the beginning of the work.
 """
 
 import time
@@ -17,7 +17,7 @@ _is_command = False
 
 @contextmanager
 def lines_of_command() -> Iterator[None]:
-    """Count from the begin of this context while it lasts."""
+    """Count over all works while this context lasts, from its beginning on."""
     global _is_command
     _is_command = True
     note_line()
@@ -39,6 +39,6 @@ def note_line() -> None:
     _last_s = time.monotonic()
 
 
-def until_line_s(every_s: float) -> float:
+def until_line_s() -> float:
     """Return the time in s until a line is due; at most 0: it is due."""
-    return every_s - (time.monotonic() - _last_s)
+    return LINE_EVERY_S - (time.monotonic() - _last_s)

@@ -16,12 +16,11 @@ from rich.progress import (
 )
 from rich.progress import Progress as RichProgress
 
-from cosim.live.monitoring.line_times import LINE_EVERY_S, begin_work, note_line, until_line_s
+from cosim.live.monitoring.line_times import begin_work, note_line, until_line_s
 from noack.core.progress import Progress
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.console import SafeConsole
 
-_LINE_EVERY_S = LINE_EVERY_S
 _LEAST_WAIT_S = 0.1
 """Between two looks whether a line is due, of a work whose inner work prints."""
 _shown: list[Event] = []
@@ -58,8 +57,8 @@ def _line_at_intervals(line: Callable[[], str], *, printed: bool) -> Iterator[No
     has_ended = Event()
 
     def print_lines() -> None:
-        while not has_ended.wait(max(until_line_s(_LINE_EVERY_S), _LEAST_WAIT_S)):
-            if until_line_s(_LINE_EVERY_S) <= 0 and _shown[-1:] == [has_ended]:
+        while not has_ended.wait(max(until_line_s(), _LEAST_WAIT_S)):
+            if until_line_s() <= 0 and _shown[-1:] == [has_ended]:
                 _print_line(line())
 
     if not printed:
@@ -159,7 +158,7 @@ def runs_bar(console: Console) -> Iterator[Progress]:
             rate = (done - before) / max(spent_s, 1e-3)
             text = f"{rate:,.0f}/s" if done > before else "starting"
             show(completed=done, total=total, rate=text)
-            if not console.is_terminal and until_line_s(_LINE_EVERY_S) <= 0:
+            if not console.is_terminal and until_line_s() <= 0:
                 _print_line(f"{done:,.0f} of {total:,.0f} runs after {spent_s:.0f} s")
 
         yield update

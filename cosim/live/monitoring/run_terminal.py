@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from cosim.live.coordination.remote_access import ListenSettings
-from cosim.live.monitoring.line_times import LINE_EVERY_S, begin_work, note_line, until_line_s
+from cosim.live.monitoring.line_times import begin_work, note_line, until_line_s
 from cosim.live.monitoring.run_observers import RunObserver
 from noack.runtime.address import address_text
 from noack.runtime.control_messages import RunProgress
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""
-_LINE_EVERY_S = LINE_EVERY_S
 
 
 class RunTerminal(RunObserver):
@@ -76,7 +75,7 @@ class RunTerminal(RunObserver):
         if self._console.is_dumb_terminal and due > self._plain_lines:
             self._plain_lines = due
             self._print(text)
-        if not self._console.is_terminal and until_line_s(_LINE_EVERY_S) <= 0:
+        if not self._console.is_terminal and until_line_s() <= 0:
             note_line()
             self._print(f"noack: {text}")
 

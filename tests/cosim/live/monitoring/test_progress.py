@@ -22,7 +22,7 @@ def test_long_work_is_not_silent_though_it_reports_nothing(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(progress, "_LINE_EVERY_S", 0.01)
+    monkeypatch.setattr(line_times, "LINE_EVERY_S", 0.01)
     printed, ends_s = "", time.monotonic() + MOST_S
     with work():
         while "\n" not in printed and time.monotonic() < ends_s:
@@ -36,7 +36,7 @@ def test_short_works_of_a_command_that_follow_each_other_are_not_silent_for_long
     is_command: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The last line was long ago when this work begins; in other programs this does not count."""
-    monkeypatch.setattr(progress, "_LINE_EVERY_S", 1000.0)
+    monkeypatch.setattr(line_times, "LINE_EVERY_S", 1000.0)
     with line_times.lines_of_command() if is_command else nullcontext():
         monkeypatch.setattr(line_times, "_last_s", time.monotonic() - 1000.0)
         printed, ends_s = "", time.monotonic() + (MOST_S if is_command else 0.5)
@@ -50,7 +50,7 @@ def test_short_works_of_a_command_that_follow_each_other_are_not_silent_for_long
 
 
 def test_the_share_is_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(progress, "_LINE_EVERY_S", 0.01)
+    monkeypatch.setattr(line_times, "LINE_EVERY_S", 0.01)
     printed, ends_s = "", time.monotonic() + MOST_S
     with progress.work_bar("proving", lines=True) as show:
         show(1.0, 4.0)
@@ -63,7 +63,7 @@ def test_the_share_is_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
 def test_work_within_other_work_prints_alone(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(progress, "_LINE_EVERY_S", 0.01)
+    monkeypatch.setattr(line_times, "LINE_EVERY_S", 0.01)
     printed, ends_s = "", time.monotonic() + MOST_S
     with progress.activity("outer"), progress.work_bar("inner", lines=True):
         capsys.readouterr()
