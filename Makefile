@@ -100,38 +100,40 @@ netem: setup ## The network: loses at most M - 1 consecutive packets
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test test-system pytest pytest-extensions fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
+.PHONY: setup setup-dev test test-system test-deep witnesses fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
 setup: $(VENV)/.installed ## Create the environment in .venv (the other targets do this if needed)
 
 setup-dev: $(VENV)/.installed-dev
 
-ifneq (,$(filter test,$(MAKECMDGOALS)))
-MAKEFLAGS += --jobs=2 # what is checked does not wait for what is tested
-endif
-# What failed is remembered apart: with --last-failed, tests of another folder would all run again.
-EXTENSION_WORKERS ?= 3
+# The levels are in tests/README.md. The extensions' tests are a process of their own: noack finds kinds of
+# scenarios in packages when it is imported, and the core is tested without them.
+PYTEST := $(BIN)/python -m pytest
 OF_EXTENSIONS := extensions --override-ini=cache_dir=.pytest_cache/extensions
-# Beside the tests, which leave the processors idle at times, the checks run, and the extensions' tests in
-# one process; their lines come last.
-test: setup-dev ## Lint, types, import rules, and tests (ARGS are pytest's, e.g. ARGS="-k mansd")
-	@trap 'kill 0' INT; $(MAKE) --no-print-directory check >$(VENV)/.checks.txt 2>&1 & checks=$$!; \
-	$(if $(ARGS),,EXTENSION_WORKERS=1 $(MAKE) --no-print-directory pytest-extensions \
-		>$(VENV)/.extensions.txt 2>&1 & extensions=$$!;) \
-	$(MAKE) --no-print-directory pytest; tested=$$?; \
-	$(if $(ARGS),,wait $$extensions || tested=$$?; cat $(VENV)/.extensions.txt;) \
-	wait $$checks; checked=$$?; cat $(VENV)/.checks.txt; exit $$((tested || checked))
+AT_ONCE := --numprocesses=$(shell nproc 2>/dev/null || echo 2) --dist=loadgroup
+# $(call LEVEL,MARKERS): tests at once on all processors, then live tests one by one, with nothing beside them.
+# Exit status 5 of pytest: no test has these markers.
+define LEVEL
+	@trap 'exit 130' INT; failed=0; run() { $(PYTEST) "$$@" || [ $$? = 5 ] || failed=1; }; \
+	run -m "($(1)) and not live" $(AT_ONCE); \
+	run $(OF_EXTENSIONS) -m "($(1)) and not live" $(AT_ONCE); \
+	run -m "($(1)) and live"; \
+	run $(OF_EXTENSIONS) -m "($(1)) and live"; \
+	exit $$failed
+endef
 
-test-system: setup-dev ## Test what needs a browser, root or a system package, and other builds
-	$(BIN)/python -m pytest -m system --numprocesses=2 --dist=loadfile $(ARGS)
-	$(if $(ARGS),,$(BIN)/python -m pytest $(OF_EXTENSIONS) -m system)
+test: setup-dev ## Run the tests: 5 minutes on two processors (ARGS are pytest's, e.g. ARGS="-k mansd")
+	$(if $(ARGS),$(PYTEST) $(ARGS),$(call LEVEL,not system and not deep))
 
-pytest: setup-dev
-	$(BIN)/python -m pytest \
-		$(or $(ARGS),-m "not system" --numprocesses=3 --dist=loadfile --no-loadscope-reorder)
+test-system: setup-dev ## Test what needs a browser, root or another build, and what the documentation shows: 4 minutes
+	$(if $(ARGS),$(PYTEST) -m system $(ARGS),$(call LEVEL,system and not deep))
 
-pytest-extensions: setup-dev
-	$(BIN)/python -m pytest $(OF_EXTENSIONS) \
-		$(or $(ARGS),-m "not system" --numprocesses=$(EXTENSION_WORKERS) --dist=loadfile --no-loadscope-reorder)
+test-deep: setup-dev ## Masses of random inputs, long searches, an hour of fuzz and one of soak; MINUTES=5 for less
+	$(call LEVEL,deep)
+	$(PYTEST) tests/fuzz --hypothesis-profile search $(AT_ONCE)
+	$(MAKE) --no-print-directory fuzz soak MINUTES=$(if $(filter file,$(origin MINUTES)),60,$(MINUTES))
+
+witnesses: setup-dev ## Search the tests' witnesses again; fail if a bound grew by more than 3 %
+	$(BIN)/python -m tests.checker.write_witnesses $(ARGS)
 
 # With ARGS only the parsers, with N or MINUTES only whole scenarios.
 fuzz: setup-dev ## New inputs for every parser, and random whole scenarios: N=2000 of them, or for MINUTES=60

@@ -7,6 +7,7 @@ new examples per test.
 import copy
 import gc
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -22,6 +23,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 
+from tests.helpers.pages import fill
+
 if TYPE_CHECKING:
     from cosim.analysis.witnesses import Witnesses
 
@@ -29,16 +32,6 @@ if TYPE_CHECKING:
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 gc.disable()  # until everything is loaded, of which nothing is garbage
-
-FIRST = (
-    "tests/native/test_sanitized.py", "tests/checker/test_random_loops.py", "tests/test_doc_programs.py",
-    "tests/checker/test_mutations.py", "tests/checker/test_periodic_rules.py",
-    "tests/integration/", "tests/native/", "tests/cosim/simulation/test_whole_loop.py", "tests/test_docs.py",
-    "tests/attacks/", "tests/test_portable.py", "tests/checker/", "tests/cosim/", "tests/fuzz/",
-    "tests/oracles/",
-    "tests/netem/", "tests/noack/plants/", "tests/noack/theory/", "tests/noack/traces/",
-)  # fmt: skip
-"""What takes longest, in this order: a worker runs whole files, and none should end alone."""
 
 settings.register_profile(
     "noack",
@@ -58,12 +51,7 @@ settings.register_profile(
 settings.load_profile("noack")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    def place(item: pytest.Item) -> int:
-        places = (place for place, begin in enumerate(FIRST) if item.nodeid.startswith(begin))
-        return next(places, len(FIRST))
-
-    items.sort(key=place)
+def pytest_collection_modifyitems() -> None:
     if settings().derandomize:
         # Hypothesis would also try constants of the loaded modules, which depend on the tests that
         # this worker has run before.
@@ -195,6 +183,19 @@ def usual_signals() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture(scope="session")
+def _documented(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fill(tmp_path_factory.mktemp("documented"))
+
+
+@pytest.fixture
+def documented_folder(_documented: Path, tmp_path: Path) -> Path:
+    """A folder of its own, with all files that the documentation's commands and snippets use."""
+    folder = tmp_path / "documented"
+    shutil.copytree(_documented, folder, symlinks=True)
+    return folder
 
 
 CONTENT: dict[str, Any] = {

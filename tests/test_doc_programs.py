@@ -1,4 +1,4 @@
-"""Run the documentation's commands, snippets and programs, and the tutorial."""
+"""Run the snippets and programs of the documentation, the way of the README, and the tutorial."""
 
 import json
 import os
@@ -16,64 +16,14 @@ import pytest
 
 from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import WITHOUT_VIEWER, wait_for
-from tests.helpers.pages import PAGES, ROOT, blocks, fences, fill, target_exists
+from tests.helpers.pages import ROOT, blocks, fences, target_exists
 
+pytestmark = pytest.mark.system
 EXAMPLES = ROOT / "docs/examples"
 FIGURES = {
     "own_plant": {"own_plant.svg", "own_plant_errors.svg"},
     "model_or_hold": {"model_or_hold.svg"},
 }
-
-
-def commands() -> Iterator[str]:
-    for page in PAGES:
-        for block in blocks(page, "sh"):
-            lines = (line.partition("#")[0].strip() for line in block.replace("\\\n", "").splitlines())
-            yield from (line.removeprefix(".venv/bin/") for line in filter(None, lines))
-
-
-@pytest.fixture(scope="module")
-def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return fill(tmp_path_factory.mktemp("docs"))
-
-
-SHORTER = {
-    "simulate": ("--no-report", "--set", "horizon_s=1"),
-    "demo": ("--no-report", "--set", "certificate.prove=false"),
-    "run": ("--no-report", "--set", "certificate.prove=false"),
-    "campaign": ("--workers", "1", "--draws", "10"),
-    "adversary": ("--set", "horizon_s=2", "--nodes", "500"),
-    "design": ("--draws", "80"),
-    "margin": ("--no-period", "--most", "2"),
-    "doctor": ("--seconds", "0.1"),
-    "certify": ("--no-search",),
-}
-"""Arguments added to a command to shorten it; other tests cover reports, figures of pages and long runs."""
-
-
-def shorter(words: list[str]) -> list[str]:
-    more = ("--effort", "5") if "--effort" in words else SHORTER.get(words[0], ())
-    more = ("--figure", "errors") if "pdf" in words else more
-    if "horizon_s" in " ".join(words) and words[0] != "adversary":
-        more = more[:1]
-    return [*words, *more]
-
-
-@pytest.mark.usefixtures("without_viewer", "no_drawing", "no_searches")
-@pytest.mark.parametrize("command", sorted(set(commands())))
-def test_every_command_works(command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program, *words = shlex.split(command.partition(" > ")[0])
-    if program == "make":
-        assert target_exists(command)
-        return
-    assert program == "noack"
-    if "--listen" in words or "--links" in words:
-        words.insert(1, "--explain")  # tests/integration/test_netem.py starts an emulator
-    monkeypatch.chdir(run_folder)
-    finished = invoke(*shorter(words))
-    assert finished.exit_code == 0, finished.output
-    if "--json" in words:
-        json.loads(finished.stdout)
 
 
 def snippets() -> list[str]:
@@ -86,10 +36,10 @@ def snippets() -> list[str]:
 @pytest.mark.usefixtures("without_viewer", "no_searches")
 @pytest.mark.parametrize("snippet", snippets())
 def test_every_snippet_runs(
-    snippet: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch,
+    snippet: str, documented_folder: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    monkeypatch.chdir(run_folder)
+    monkeypatch.chdir(documented_folder)
     exec(compile(snippet, "snippet", "exec"), {"__name__": "__main__"})
     assert capsys.readouterr().out.strip()
 
@@ -128,6 +78,7 @@ def test_the_tests_of_a_page_pass(tmp_path: Path) -> None:
     assert finished.returncode == 0, finished.stdout
 
 
+@pytest.mark.live
 @pytest.mark.usefixtures("without_viewer", "no_drawing")
 def test_the_way_of_the_readme_leads_from_a_plant_to_a_live_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -227,6 +178,7 @@ def test_commands_of_the_tutorial_print_the_shown_output(
         assert any(alike(line, printed) for printed in output), line
 
 
+@pytest.mark.live
 def test_the_runtime_parameter_of_the_tutorial_can_be_changed(folder: Path) -> None:
     """One terminal runs the loop; another changes a runtime parameter and then sends SIGINT."""
     run, change = LIVE

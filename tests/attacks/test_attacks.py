@@ -6,6 +6,8 @@ from noack.protocol.roles import LOOP_ROLES
 from tests.attacks.attacked import CHECKS, Attacked, attack, may_forge_addresses
 from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, PEER, STRANGER
 
+pytestmark = pytest.mark.live
+
 PER_PORT = 1_500
 RATE_HZ = 4000.0
 

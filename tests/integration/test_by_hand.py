@@ -20,6 +20,8 @@ from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.run_descriptor import parse_descriptor
 from tests.helpers import live_runs as live
 
+pytestmark = pytest.mark.live
+
 Start = Callable[..., live.Running]
 ByHand = Callable[[str], subprocess.Popen[str]]
 RECORD = ("record", "lane_following")

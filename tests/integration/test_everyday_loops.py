@@ -11,6 +11,8 @@ from noack.core.linear_systems import Vector
 from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import BARE, settings
 
+pytestmark = pytest.mark.live
+
 TRACK = ["t_s,angle,speed,voltage"]
 for t_s in np.arange(0.0, 2.005, 0.01):  # 0.2 rad to and fro: ÿ = 4 u − 2 ẏ
     y, rate, slope = 0.1 * (1 - np.cos(3 * t_s)), 0.3 * np.sin(3 * t_s), 0.9 * np.cos(3 * t_s)

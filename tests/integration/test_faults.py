@@ -21,6 +21,8 @@ from noack.protocol.roles import LOOP_ROLES, ROLES
 from tests.helpers import live_runs as live
 from tests.helpers.command_line import invoke
 
+pytestmark = pytest.mark.live
+
 Start = Callable[..., live.Running]
 LONG = [*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0)]
 

@@ -20,7 +20,7 @@ from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import Start, wait_for_end
 from tests.helpers.two_hosts import TwoHosts, two_hosts
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.live, pytest.mark.system]
 
 AHEAD_S = 3
 """The monotonic clock of the second host is ahead by this: it is another clock."""

@@ -5,10 +5,13 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from cosim.analysis.replay import replay
 from cosim.record.run_record import load_run
 from tests.helpers.live_runs import run_scenario, settings
+
+pytestmark = pytest.mark.live
 
 
 def test_loops_of_different_odd_rates_are_replayed_bit_for_bit(tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ from noack.protocol.wire_format import Flow, read_header
 from tests.helpers import live_runs as live
 from tests.helpers.live_runs import AT_RATE, Finished, assert_complete, run_scenario, settings
 
+pytestmark = pytest.mark.live
+
 MANSD = 2
 IMPAIRMENTS = [
     {"kind": "delay", "delay_s": 0.01, "jitter_s": 0.02},

@@ -6,7 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.netem.relay.relays import endpoints
+
+pytestmark = pytest.mark.live
 
 
 def test_several_links_are_relayed_and_counted(tmp_path: Path) -> None:

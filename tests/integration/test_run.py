@@ -47,18 +47,15 @@ from tests.helpers.live_runs import (
 from tests.oracles.explained_run.explain import explains
 from tests.oracles.explained_run.findings import SCHEDULE
 
+pytestmark = pytest.mark.live
+
 CERTIFIED = "certified for the scenario's plant"
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """A run on a machine that did not stall: a process that ends misses what others send later."""
-    for _ in range(10):
-        with start_runs(tmp_path_factory.mktemp("finished")) as begin:
-            run = begin(*settings(speed=2.5, horizon_s=10.0), viewer=True).finish()
-        if run.status or max(late["max"] for late in run.summary["loops"][0]["lateness_us"].values()) < 1e5:
-            break
-    return run
+    with start_runs(tmp_path_factory.mktemp("finished")) as begin:
+        return begin(*settings(speed=2.5, horizon_s=10.0), viewer=True).finish()
 
 
 @pytest.fixture(scope="module")
@@ -232,7 +229,6 @@ def test_changes_are_recorded_and_are_no_violation(changed: ChangedRun) -> None:
 RATE_HZ = 5.0
 HORIZON_S = 8.0
 ENOUGH_S = 4.0
-ATTEMPTS = 20
 SAME = {
     PLANT_STEP: ("input", "sequence", "t_ns", "actuation"),
     PLANT_ACTUATION: ("input", "sequence", "t_ns"),
@@ -272,10 +268,7 @@ def in_turn_until_ns(live: RunRecord, simulated: RunRecord) -> int:
 
 
 def test_a_live_run_agrees_with_the_simulated_run(tmp_path: Path) -> None:
-    """Up to a stall: with steps of 200 ms, only one of 100 ms changes the order of events.
-
-    A run with an early stall is repeated.
-    """
+    """Up to a stall: with steps of 200 ms, only a process that is 50 ms late changes the order of events."""
     values = {
         "horizon_s": HORIZON_S,
         "plant__rate_hz": RATE_HZ,
@@ -285,18 +278,15 @@ def test_a_live_run_agrees_with_the_simulated_run(tmp_path: Path) -> None:
         "network__initial_sync": "known_state",
         "plant__measure_every": 2,
     }
-    for _ in range(ATTEMPTS):
-        finished = run_scenario(tmp_path / "runs", *settings(**values))
-        assert finished.status == 0, finished.stderr
-        live = load_record(finished.run_dir)
-        simulated = simulate(live.scenario)
-        assert (simulated[SENSOR_MEASUREMENT]["event"] >= 0).sum() > 3
-        until_ns = in_turn_until_ns(live, simulated)
-        compare(live, simulated, until_ns)
-        if until_ns >= ENOUGH_S * 1e9:
-            break
-    else:
-        pytest.fail(f"{ATTEMPTS} live runs went another way within their first {ENOUGH_S} s")
+    finished = run_scenario(tmp_path / "runs", *settings(**values))
+    assert finished.status == 0, finished.stderr
+    live = load_record(finished.run_dir)
+    simulated = simulate(live.scenario)
+    assert (simulated[SENSOR_MEASUREMENT]["event"] >= 0).sum() > 3
+    until_ns = in_turn_until_ns(live, simulated)
+    compare(live, simulated, until_ns)
+    if until_ns < ENOUGH_S * NS_PER_S:
+        assert max(late["max"] for late in finished.loop["lateness_us"].values()) > 5e4
 
 
 def compare(live: RunRecord, simulated: RunRecord, until_ns: int) -> None:

@@ -11,6 +11,8 @@ from cosim.record.run_record import load_run
 from noack.protocol.wire_format import read_header
 from tests.helpers import live_runs as live
 
+pytestmark = pytest.mark.live
+
 DIFFERENT = ("lane", "pendulum-1", "pendulum-2", "mass")
 SIZES = {"lane": 4, "pendulum-1": 2, "pendulum-2": 2, "mass": 2}
 STEPS = {"lane": 1501, "pendulum-1": 301, "pendulum-2": 301, "mass": 1501}

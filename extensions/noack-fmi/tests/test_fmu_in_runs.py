@@ -89,10 +89,15 @@ def test_settings_that_are_wrong_are_refused(scenario: Path, setting: str, expec
     assert expected in done.stderr
 
 
-def test_linearise_takes_the_file_and_a_live_run_the_scenario(scenario: Path) -> None:
+@pytest.mark.usefixtures("scenario")
+def test_linearise_takes_the_file() -> None:
     linear = json.loads(invoke("linearise", "oscillator.fmu", "--json").stdout)
     np.testing.assert_allclose(linear["A"], [[0, 1], [-1, 1]], atol=1e-4)
     done = invoke("linearise", "gone.fmu")
     assert 'plant.system.file = "gone.fmu": cannot be read: No such file' in done.stderr
+
+
+@pytest.mark.live
+def test_a_live_run_takes_the_scenario(scenario: Path) -> None:
     done = invoke("run", scenario, "--set", "horizon_s=1", "--no-report", "--set", "ports={}")
     assert done.exit_code == 0, done.output

@@ -12,7 +12,7 @@ import pytest
 
 import noack
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.live, pytest.mark.system]
 
 OpenPage = Callable[..., Any]
 TEXT = "document.body.innerText"

@@ -74,6 +74,7 @@ def test_a_plant_in_ros2_moves_as_the_same_plant_in_noack(port: int) -> None:
     assert run.replay().bit_exact
 
 
+@pytest.mark.live
 def test_a_plant_in_ros2_takes_part_in_a_live_run(port: int) -> None:
     with node(EXAMPLE, port):
         run = noack.run(noack.load(in_ros2(port)))
@@ -102,6 +103,7 @@ def test_a_ros2_node_that_does_not_answer_is_named(port: int) -> None:
     assert "router nonsense: give it as tcp/127.0.0.1:7447" in result.output
 
 
+@pytest.mark.live
 def test_an_independent_client_receives_a_live_run(port: int, tmp_path: Path) -> None:
     with node(LISTENER, port) as listener:
         words = ("--listen", "--router", f"tcp/127.0.0.1:{port}", "--runs", tmp_path)

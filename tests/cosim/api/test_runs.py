@@ -78,6 +78,7 @@ def test_a_run_of_the_api_has_an_ordinary_run_directory(
     assert newest.report() == newest.directory / "report.html"
 
 
+@pytest.mark.live
 def test_an_interrupted_live_run_is_returned() -> None:
     program = (
         "import noack\n"

@@ -32,6 +32,7 @@ class Follower(noack.RunObserver):
         self._thread.join()
 
 
+@pytest.mark.live
 @pytest.mark.usefixtures("no_report", "no_recording")
 def test_who_follows_a_run_receives_rows_of_its_record() -> None:
     follower = Follower()

@@ -214,6 +214,7 @@ def test_why_a_run_ends_early_is_shown_before_its_processes_end(case: Case) -> N
     assert (status, reason) == (ExitStatus.FAILED, "plant died: killed by SIGKILL")
 
 
+@pytest.mark.live
 def test_after_a_second_signal_the_record_is_incomplete_and_can_be_completed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

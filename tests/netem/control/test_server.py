@@ -171,6 +171,7 @@ def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
     assert [line.split("  ")[1] for line in lines] == ["up forward", "down", "up forward", "down"]
 
 
+@pytest.mark.live
 def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:
     sent = [number.to_bytes(2) for number in range(320)]
     with endpoints(*["127.0.0.1"] * 2) as (server, client):

@@ -20,6 +20,8 @@ from tests.helpers.two_hosts import TwoHosts, enter_namespace, two_hosts
 from tests.helpers.waiting import wait_for
 from tests.netem.conftest import Emulate
 
+pytestmark = [pytest.mark.live, pytest.mark.system]
+
 SLOW_LINE = ("tbf", "rate", "800kbit", "burst", "40kb", "limit", "40kb")
 """Its queue is smaller than the number of packets that arrive within milliseconds.
 

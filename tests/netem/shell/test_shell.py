@@ -20,7 +20,7 @@ from netem.shell import process, shell
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.command_line import Signals
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.live, pytest.mark.system]
 
 ENDS = str(Path(__file__).with_name("ends.py"))
 SHELL = [sys.executable, "-m", "netem", "shell"]
