@@ -149,8 +149,6 @@ class Plan:
     rate_hz: float
     """Datagrams per second to each port."""
     forge_addresses: bool
-    until_s: float
-    """Latest end on the monotonic clock, even if datagrams are left."""
     namespace: str | None = None
     """Network namespace of the attacker."""
 
@@ -182,13 +180,11 @@ def _datagrams(make: Make, target: Target, rng: random.Random) -> Iterator[bytes
         yield made[-1] if len(made) < _DISTINCT else rng.choice(made)
 
 
-def _paced(count: int, rate_hz: float, until_s: float) -> Iterator[int]:
+def _paced(count: int, rate_hz: float) -> Iterator[int]:
     """Count at a steady rate; after a long stall, do not catch up in one burst."""
     due_s = time.monotonic()
     for number in range(count):
         now_s = time.monotonic()
-        if now_s > until_s:
-            return
         if due_s > now_s:
             time.sleep(due_s - now_s)
         due_s = max(due_s, now_s - _LONGEST_BURST_S)
@@ -208,7 +204,7 @@ def carry_out(plan: Plan) -> Sent:
         if plan.forge_addresses and target.is_forgeable and target.role != "netem":
             kinds += [(PEER, kind) for kind in FROM_THE_PEER]
         arms.append([(by, kind, _datagrams(FROM_ANYWHERE[kind], target, rng)) for by, kind in kinds])
-    for number in _paced(plan.per_port, plan.rate_hz, plan.until_s):
+    for number in _paced(plan.per_port, plan.rate_hz):
         for target, of_target in zip(plan.targets, arms, strict=True):
             by, kind, datagrams = of_target[number % len(of_target)]
             sender.send(target, by, number, next(datagrams))

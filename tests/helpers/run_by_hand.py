@@ -2,9 +2,11 @@
 
 import json
 import os
+import signal
 import subprocess
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from noack.protocol.roles import LOOP_ROLES
@@ -53,6 +55,12 @@ class RunByHand:
         """Wait for a condition; fail if the recording ends before."""
         wait_for(lambda: condition() or self._recording.poll() is not None)
         assert self._recording.poll() is None, self._recording.communicate()
+
+    def stop(self) -> Finished:
+        """Stop the run as a user does; return its result, with the recording's exit status."""
+        self._recording.send_signal(signal.SIGINT)
+        finished = self.finish()
+        return replace(finished, status=self._recording.returncode)
 
     def finish(self) -> Finished:
         """Wait for the end of the run; return its result, with the largest exit status."""
