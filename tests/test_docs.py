@@ -290,7 +290,7 @@ def test_the_bounds_by_gains_on_the_page_of_the_theory_are_proven() -> None:
         assert (name, value) == (name, bound_on_page(by_gains(name), ""))
 
 
-@pytest.mark.system  # a minute of CPU time
+@pytest.mark.deep  # a minute of CPU time
 @pytest.mark.usefixtures("nothing_was_found_before")
 def test_the_bounds_after_a_search_on_the_page_of_the_theory_are_found() -> None:
     """To 1 %: the command searches other statements first, and begins with what it found for them."""

@@ -16,7 +16,7 @@ LIKE_OTHERS = {"lane_5g_arterial", "lane_5g_rural", "lane_weighted"}
 USUAL = {"lane_following", "dc_motor_load", "friction_servo", "model_predictive"}
 """Scenarios that are tried by every ``make test``: a linear plant, a load, equations, no bounds."""
 SCENARIOS = [
-    pytest.param(name, marks=() if name in USUAL else pytest.mark.system)
+    pytest.param(name, marks=() if name in USUAL else pytest.mark.deep)
     for name in sorted({file.stem for file in FILES} - LIKE_OTHERS)
 ]
 

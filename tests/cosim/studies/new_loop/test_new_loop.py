@@ -140,8 +140,8 @@ def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
     "name",
     [
         "cart_pole",
-        pytest.param("quadrotor", marks=pytest.mark.system),  # takes a minute
-        pytest.param("dc_motor", marks=pytest.mark.system),
+        pytest.param("quadrotor", marks=pytest.mark.deep),  # takes a minute
+        pytest.param("dc_motor", marks=pytest.mark.deep),
         "four_tank",
         "unstable_pendulum",
     ],
