@@ -7,18 +7,15 @@ signs a certificate for the recording host and one for each role; how they are u
 
 import datetime
 import ipaddress
-import os
-import shutil
 import socket
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from cosim.live.coordination.credentials_folder import credentials_folder
 from noack.core.clock import clock_identity
 from noack.core.errors import CallerError, PeerError, why
-from noack.core.file_access import move, open_folder
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.address import Address, address_text, parse_address
 from noack.runtime.connections.credentials import CA_FILE, CERTIFICATE_FILE, KEY_FILE, RUN_FILE, own_host
@@ -90,69 +87,36 @@ def require_free(address: Address) -> None:
 def credentials(listening: ListenSettings, access: RunAccess, scenario: Scenario) -> Iterator[RunAccess]:
     """Write the folder of credentials; yield the access of the end that listens.
 
-    The folder is private: each role's part of it gives access to the run. It replaces that of an
-    earlier run, and is removed at the end. Raise CallerError if it cannot be written.
+    The folder is private: each role's part of it gives access to the run. It is removed at the end.
+    Raise CallerError if it cannot be written.
     """
-    from cosim.live.coordination.certificate_authority import CertificateAuthority  # imports cryptography
-
     folder = listening.folder
     access = access.model_copy(update={"remote": listening.address, "launched": False})
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(credentials_folder(folder, _files(listening, access, scenario)))
+        except OSError as error:
+            raise CallerError(f"{folder}: the credentials cannot be written: {why(error)}") from None
+        yield access.model_copy(update={"credentials": str((folder / RECORDER).resolve())})
+
+
+def _files(listening: ListenSettings, access: RunAccess, scenario: Scenario) -> dict[str, bytes]:
+    """Return the content of each role's files, by their paths in the folder of credentials."""
+    from cosim.live.coordination.certificate_authority import CertificateAuthority  # imports cryptography
+
     run_s = scenario.horizon_s / scenario.speed
     authority = CertificateAuthority(_TO_START + datetime.timedelta(seconds=run_s))
-    try:
-        with _replacing(folder) as new:
-            for role in (RECORDER, *LOOP_ROLES):
-                part = new / role
-                part.mkdir(mode=0o700)
-                address = listening.address[0] if role == RECORDER else None
-                certificate, key = authority.key_pair(role, address)
-                files = {CA_FILE: authority.certificate, CERTIFICATE_FILE: certificate, KEY_FILE: key}
-                if role != RECORDER:
-                    of_role = access.model_copy(update={"credentials_for": role})
-                    descriptor = new_descriptor(of_role, scenario)
-                    files[RUN_FILE] = (descriptor.model_dump_json(indent=1) + "\n").encode()
-                for name, content in files.items():
-                    _write_private(part / name, content)
-        identity = _identity(folder)
-    except OSError as error:
-        raise CallerError(f"{folder}: the credentials cannot be written: {why(error)}") from None
-    try:
-        yield access.model_copy(update={"credentials": str((folder / RECORDER).resolve())})
-    finally:
-        with suppress(OSError):
-            if _identity(folder) == identity:  # else another run has replaced it
-                shutil.rmtree(folder)
-
-
-@contextmanager
-def _replacing(folder: Path) -> Iterator[Path]:
-    """Give a new private folder, which takes the place of an older folder of credentials.
-
-    Raise OSError or CallerError if that is impossible.
-    """
-    if folder.is_symlink() or (folder.exists() and not _is_of_credentials(folder)):
-        raise CallerError(f"{folder}: exists, and is not a folder of credentials; give another")
-    with open_folder(folder.parent):  # no link of another user is on the way
-        new = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    try:
-        yield new
-        if folder.exists():
-            shutil.rmtree(folder)
-        move(new, folder)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
-
-
-def _is_of_credentials(folder: Path) -> bool:
-    return folder.is_dir() and {path.name for path in folder.iterdir()} <= {RECORDER, *LOOP_ROLES}
-
-
-def _identity(folder: Path) -> tuple[int, int]:
-    status = folder.lstat()
-    return status.st_dev, status.st_ino
-
-
-def _write_private(path: Path, content: bytes) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(content)
+    files: dict[str, bytes] = {}
+    for role in (RECORDER, *LOOP_ROLES):
+        address = listening.address[0] if role == RECORDER else None
+        certificate, key = authority.key_pair(role, address)
+        files |= {
+            f"{role}/{CA_FILE}": authority.certificate,
+            f"{role}/{CERTIFICATE_FILE}": certificate,
+            f"{role}/{KEY_FILE}": key,
+        }
+        if role != RECORDER:
+            of_role = access.model_copy(update={"credentials_for": role})
+            descriptor = new_descriptor(of_role, scenario)
+            files[f"{role}/{RUN_FILE}"] = (descriptor.model_dump_json(indent=1) + "\n").encode()
+    return files

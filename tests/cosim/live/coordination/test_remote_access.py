@@ -6,7 +6,6 @@ The sessions of zenoh are real, on loopback.
 import json
 import shutil
 import socket
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import pytest
 import zenoh
 
 from cosim.live.coordination import remote_access
+from cosim.live.coordination.credentials_folder import MARK
 from cosim.live.coordination.remote_access import ListenSettings, credentials
 from noack.core.errors import CallerError, MachineError, NoAnswerError, PeerError
 from noack.protocol.roles import COORDINATOR, LOOP_ROLES, RECORDER
@@ -83,13 +83,11 @@ def test_a_taken_address_and_one_of_another_host_are_refused() -> None:
 # --- the folder -----------------------------------------------------------------------------------
 
 
-def test_the_folder_is_private_and_goes_with_the_run(settings: ListenSettings, tmp_path: Path) -> None:
+def test_the_folder_has_the_credentials_of_each_role(settings: ListenSettings, tmp_path: Path) -> None:
     folder = settings.folder
     with credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario) as own:
         assert own.credentials == str(folder / RECORDER)
-        assert {path.name for path in folder.iterdir()} == {RECORDER, *LOOP_ROLES}
-        for path in (folder, *folder.rglob("*")):
-            assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600)
+        assert {path.name for path in folder.iterdir()} == {RECORDER, *LOOP_ROLES, MARK}
         keys = [path.read_bytes() for path in folder.rglob("private_key.pem")]
         assert len({*keys}) == 5
         descriptor = read_credentials(folder / "sensor", "sensor", tmp_path / "kept")
@@ -98,24 +96,10 @@ def test_the_folder_is_private_and_goes_with_the_run(settings: ListenSettings, t
         assert descriptor.run_dir == str(tmp_path / "kept" / "run")
         assert descriptor.key == RUN_DESCRIPTOR.key
         assert not descriptor.launched
-        with credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario):  # of a later run
-            later = (folder / "sensor" / "ca.pem").read_bytes()
-        assert not folder.exists()
-        with credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario):
-            assert (folder / "sensor" / "ca.pem").read_bytes() != later
-            folder.rename(tmp_path / "moved")
-            shutil.copytree(tmp_path / "moved", folder)
-        assert folder.exists()  # it is another one
-
-
-@pytest.mark.parametrize("name", ["notes.txt", "a/b"])
-def test_another_folder_is_not_replaced(settings: ListenSettings, name: str) -> None:
-    path = settings.folder / name
-    path.parent.mkdir(parents=True)
-    path.touch()
-    with pytest.raises(CallerError, match="exists, and is not a folder of credentials"):
-        credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario).__enter__()
-    assert path.exists()
+        authority = (folder / "sensor" / "ca.pem").read_bytes()
+    assert not folder.exists()
+    with credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario):
+        assert (folder / "sensor" / "ca.pem").read_bytes() != authority
 
 
 def test_a_folder_that_cannot_be_written_is_named(settings: ListenSettings) -> None:
