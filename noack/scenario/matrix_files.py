@@ -23,6 +23,7 @@ from noack.core.errors import CallerError, why
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.scenario.mat_file import arrays_of_mat
 from noack.scenario.sections import ModelSection, instability
 from noack.scenario.toml_file import brief
 from noack.settings.section import ReadTable, require_shape, rows_of
@@ -192,7 +193,7 @@ def _arrays(file: NamedFile) -> Arrays:
     if arrays > _MOST_ARRAYS:
         file.wrong(f"has {arrays:,} arrays; at most {_MOST_ARRAYS:,} are read")
     try:
-        return _npz_arrays(content) if file.path.suffix == NPZ else _mat_arrays(content)
+        return _npz_arrays(arrays_of_mat(content, _MOST_ENTRIES) if file.path.suffix == MAT else content)
     except NotImplementedError:
         file.wrong("is of MATLAB's v7.3, which is HDF5; save it as v7: save(name, '-v7')")
     except Exception:  # an invalid file can raise any error
@@ -213,21 +214,6 @@ def _npz_arrays(content: bytes) -> Arrays:
                 if np.prod(shape, dtype=float) <= _MOST_ENTRIES and kind.kind in _NUMBERS + "c":
                     array.seek(0)
                     arrays[name] = np.lib.format.read_array(array, allow_pickle=False)
-    return arrays
-
-
-def _mat_arrays(content: bytes) -> Arrays:
-    """Return the arrays of numbers that are not too large, by name."""
-    from scipy.io import loadmat  # imported here: it takes time and memory
-
-    with warnings.catch_warnings(action="ignore"):
-        variables = loadmat(io.BytesIO(content))  # type: ignore[arg-type] # accepts files, too
-    arrays = {}
-    for name, value in variables.items():
-        if np.prod(getattr(value, "shape", (np.inf,)), dtype=float) <= _MOST_ENTRIES:
-            array = value.toarray() if hasattr(value, "toarray") else value
-            if array.dtype.kind in _NUMBERS + "c":
-                arrays[name] = array
     return arrays
 
 

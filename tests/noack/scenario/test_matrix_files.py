@@ -55,12 +55,28 @@ def test_model_and_plant_may_come_from_two_files(gain: str, tmp_path: Path) -> N
     assert load(tmp_path / "again.toml") == resolved
 
 
-def test_a_mat_file_may_have_sparse_matrices_integers_and_text(tmp_path: Path) -> None:
-    content = {"A": csc_matrix(A), "B": B.astype(np.int8), "K": K, "unrelated": "text"}
-    savemat(tmp_path / "m.mat", content)
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_mat_file_may_have_sparse_matrices_integers_and_text(compressed: bool, tmp_path: Path) -> None:
+    content = {"A": csc_matrix(A), "B": B.astype(np.int8), "K": K, "unrelated": "text", "file": K}
+    savemat(tmp_path / "m.mat", content, do_compression=compressed)
     loaded = scenario(tmp_path, 'file = "m.mat"')
     assert np.array_equal(np.array(loaded.model.A), A)
     assert (loaded.model.B, loaded.model.gain) == (((0.0,), (1.0,)), ((-8.0, -4.0),))
+
+
+CRASHES = Path(__file__).parents[2] / "cases" / "segv.mat"
+"""SciPy reads the imaginary part of B, of which the file has only the flag: a segmentation fault."""
+
+
+@pytest.mark.parametrize(
+    "content", [CRASHES.read_bytes(), CRASHES.read_bytes()[:200], b"MATLAB", b""],
+    ids=["crashes", "ends early", "text", "empty"],
+)  # fmt: skip
+def test_a_damaged_mat_file_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "m.mat").write_bytes(content)
+    assert lines_of_error(lambda: scenario(tmp_path, 'file = "m.mat"')) == [
+        f'{tmp_path / "filed.toml"}: model.file = "m.mat": is not a .mat file, or is damaged'
+    ]
 
 
 @pytest.mark.parametrize(
