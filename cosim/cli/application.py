@@ -68,6 +68,16 @@ class Program(TyperGroup):
             sys.exit(int(status or 0))
         return status
 
+    def resolve_command(
+        self, ctx: "Context", args: list[str]
+    ) -> tuple[str | None, "Command | None", list[str]]:
+        """Return the command that the words name, and its words; refuse a repeated option."""
+        name, command, words = super().resolve_command(ctx, args)
+        if command is not None and not ctx.resilient_parsing:  # a completion has unfinished words
+            context = command.context_class(command, ctx, name, **command.context_settings)
+            _refuse_repeated(command, context, words)
+        return name, command, words
+
     def invoke(self, ctx: "Context") -> int:
         """Run the command of the command line; return its exit status."""
         try:
@@ -100,7 +110,8 @@ class Program(TyperGroup):
         message = _with_value(message.removeprefix("invalid value: "), self._words)
         if self._words and (missing := missing_extension("noack.commands", self._words[0])):
             return f"{NAME} {self._words[0]}: {missing}"
-        name = next((word for word in self._words if word in self.commands), None)
+        name = next((word for word in self._words if not word.startswith("-")), None)
+        name = name if name in self.commands else None
         where, command = (f"{name}: ", f"{NAME} {name}") if name else ("", NAME)
         if option := getattr(error, "option_name", None):
             hint = _setting_hint(option, self.commands.get(name or ""))
@@ -153,6 +164,16 @@ def _refuse_empty(words: Sequence[str]) -> None:
             raise typer.BadParameter("an argument is empty")
         if option.startswith("--") and "=" in word and not value:
             raise typer.BadParameter(f"the value of {option} is empty")
+
+
+def _refuse_repeated(command: "Command", ctx: "Context", words: Sequence[str]) -> None:
+    """Raise BadParameter if an option that takes one value is given twice; flags take none."""
+    _, _, given = command.make_parser(ctx).parse_args([*words])
+    for parameter in given:
+        is_single = not getattr(parameter, "is_flag", False) and not getattr(parameter, "multiple", False)
+        if parameter.param_type_name == "option" and is_single and given.count(parameter) > 1:
+            option = max(parameter.opts, key=len)
+            raise typer.BadParameter(f"{option} is given twice; it takes one value", ctx)
 
 
 def examples_of(command: "Command") -> list[str]:

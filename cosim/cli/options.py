@@ -137,7 +137,8 @@ SetOption = Annotated[
     Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Replace a value of the scenario, e.g. trigger.beta=0.3, or for short beta=0.3.",
+        help="Replace a value of the scenario, e.g. trigger.beta=0.3, or for short beta=0.3; "
+        "KEY=none takes a key out.",
         autocompletion=complete_settings,
     ),
 ]

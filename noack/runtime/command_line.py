@@ -25,7 +25,7 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from noack.core.errors import CallerError, ExitStatus, MachineError, printable, why, with_short_words
 
@@ -137,8 +137,37 @@ def log_event(level: str, source: str, message: str, **fields: object) -> bool:
     return True
 
 
+class _StoreOnce(argparse.Action):
+    """The value of an option, which may be given once; argparse's own keeps the last one."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        """Store the values."""
+        assert isinstance(parser, Parser)
+        if option_string is not None and self.dest in parser.given_options:
+            raise argparse.ArgumentError(self, "is given twice; it takes one value")
+        parser.given_options.add(self.dest)
+        setattr(namespace, self.dest, values)
+
+
 class Parser(argparse.ArgumentParser):
-    """A parser that raises errors instead of printing usage and exiting."""
+    """A parser that raises errors instead of printing usage and exiting; an option is given once."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.given_options = set[str]()
+        for action in (None, "store"):
+            self.register("action", action, _StoreOnce)
+
+    def parse_known_args(self, *args: Any, **options: Any) -> Any:
+        """Parse the words; the arguments are those of :class:`argparse.ArgumentParser`."""
+        self.given_options.clear()
+        return super().parse_known_args(*args, **options)
 
     def error(self, message: str) -> NoReturn:
         """Raise CallerError."""

@@ -37,6 +37,8 @@ _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
 _OF_FILES = ("sha256", "t_s", "x", "u", "samples_s", "intervals_s", "times_ms", "sent_ns", "delays_ns")
 """What a loaded scenario has beside or instead of a file's name: the hash of a program, the numbers of
 a reference, of delays, of outages, of a recording."""
+REMOVED = "none"
+"""The value of ``--set`` that removes a key; a text of these letters is written in quotes."""
 MOST_RECORDED_BYTES = 2**28
 """Largest size of a run's scenario file, which includes the losses and delays read from files."""
 
@@ -58,7 +60,7 @@ def load(
     Raises:
         CallerError: one line per mistake, each with file (or ``--set``), key, value and remedy.
     """
-    return load_with(path, [setting_of(override) for override in overrides], "--set ", most_bytes, network)
+    return load_with(path, settings_of(overrides), "--set ", most_bytes, network)
 
 
 def load_with(
@@ -125,10 +127,7 @@ def completed_with(
     given = copy.deepcopy(content) if settings else content
     # A hash comes after its file's name, which removes that of the old file.
     for key, value in sorted(settings, key=lambda setting: setting[0].endswith(".sha256")):
-        if value is None:
-            remove(content, key)
-        else:
-            put(content, key, value, f"{named}{key}")
+        put(content, key, value, f"{named}{key}")
     try:
         return completed(content, path)
     except CallerError as error:
@@ -328,13 +327,25 @@ def _attributed(lines: str, path: Path, keys: Sequence[str], given: ReadTable, n
     return re.sub(rf"^(?P<file>{file}): (?P<rest>.*)", attributed, lines, flags=re.MULTILINE)
 
 
-def setting_of(override: str, example: str = "trigger.beta=0.3") -> tuple[str, object]:
-    """Return key and value of ``--set KEY=VALUE``; raise CallerError if it is written otherwise."""
+def settings_of(overrides: Iterable[str], example: str = "trigger.beta=0.3") -> list[tuple[str, object]]:
+    """Return keys and values of ``--set KEY=VALUE``; the value None, of ``KEY=none``, removes a key.
+
+    Raises:
+        CallerError: a setting is written otherwise, or a key is given twice.
+    """
+    settings = [_setting_of(override, example) for override in overrides]
+    keys = [full_key(key) for key, _ in settings]
+    if repeated := [key for key in keys if keys.count(key) > 1]:
+        raise CallerError(f"--set {shortened(printable(repeated[0]))}: is given twice")
+    return settings
+
+
+def _setting_of(override: str, example: str) -> tuple[str, object]:
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
         excerpt = shortened(printable(override))
         raise CallerError(f"--set {excerpt}: write it as key=value, e.g. {example}")
-    return key.strip(), value_of(text, f"--set {key}")
+    return key.strip(), None if text.strip() == REMOVED else value_of(text, f"--set {key}")
 
 
 def value_of(text: str, source: str) -> object:
@@ -351,10 +362,10 @@ def value_of(text: str, source: str) -> object:
 
 
 def put(content: Table, key: str, value: object, source: str) -> None:
-    """Set the value of a key such as ``trigger.beta``, which may be short; create missing tables.
+    """Set the value of a key such as ``trigger.beta``, which may be short; None removes the key.
 
-    With the name of a file, what is there of another one is removed: its hash, or its numbers. An
-    entry of a list is named by its number: ``network.impairments.0.rate_bps``.
+    Missing tables are created. With the name of a file, what is there of another one is removed: its
+    hash, or its numbers. An entry of a list is named by its number: ``network.impairments.0.rate_bps``.
 
     Raises:
         CallerError: a part of the key is a value, not a table; a list has no such entry; or the key
@@ -362,6 +373,9 @@ def put(content: Table, key: str, value: object, source: str) -> None:
     """
     table: object = content
     *path, last = full_key(key).split(".")
+    if value is None:
+        _remove(content, full_key(key), source)
+        return
     if len(path) >= toml_file.MOST_LEVELS:
         raise CallerError(f"{source}: the key has more than {toml_file.MOST_LEVELS} parts")
     for depth, part in enumerate(path):
@@ -378,18 +392,36 @@ def put(content: Table, key: str, value: object, source: str) -> None:
         entries[number] = copy.deepcopy(value)
 
 
-def remove(content: Table, key: str) -> None:
-    """Remove a key such as ``trigger.beta``, which may be short; it need not be there."""
+def _remove(content: Table, key: str, source: str) -> None:
+    """Remove a key, or an entry of a list; it need not be there, but a scenario must know it.
+
+    Raises:
+        CallerError: no scenario has such a key.
+    """
     table: object = content
-    *path, last = full_key(key).split(".")
+    *path, last = key.split(".")
     for part in path:
         if isinstance(table, list) and part.isdecimal():
             table = table[int(part)] if int(part) < len(table) else None
         else:
             table = table.get(part) if isinstance(table, dict) else None
-    if isinstance(table, dict):
+    if isinstance(table, list):
+        entries, number = _list_entry(table, last, f"{source}: {'.'.join(path)}")
+        del entries[number]
+    elif isinstance(table, dict) and last in table:
         _forget_file(table, last)
-        table.pop(last, None)
+        del table[last]
+    elif path[:1] != ["loops"]:
+        _require_known(key, source)
+
+
+def _require_known(key: str, source: str) -> None:
+    """Raise CallerError unless this is a key or a table of a scenario."""
+    known = known_keys(Scenario)
+    if not any(f"{each}.".startswith(f"{key}.") for each in known):
+        nearest = nearest_key(key, (*SHORT, *known))
+        hint = f"did you mean {nearest}?" if nearest else "`noack check` prints a scenario's keys"
+        raise CallerError(printable(f"{source}: unknown key; {hint}"))
 
 
 def _forget_file(table: Table, key: str) -> None:

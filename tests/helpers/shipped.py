@@ -3,14 +3,14 @@
 from cosim.shipped_files import find_shipped
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import completed_with, setting_of
+from noack.scenario.scenario_file import completed_with, settings_of
 from noack.scenario.toml_file import read
 
 
 def shipped(name: str, *settings: str) -> Scenario:
     """Return a shipped scenario with settings; with another model its outputs are the states."""
     path = find_shipped(name, "scenarios")
-    content, given = read(path, Scenario), [setting_of(setting) for setting in settings]
+    content, given = read(path, Scenario), settings_of(settings)
     if "model" in dict(given):
         content.pop("outputs", None)
     return completed_with(content, given, path, "--set ")

@@ -185,9 +185,9 @@ def new(
 
 def _table(assignments: Sequence[str] | None) -> dict[str, object]:
     """Return the values of --set by their keys."""
-    from noack.scenario.scenario_file import setting_of
+    from noack.scenario.scenario_file import settings_of
 
-    return dict(setting_of(assignment, "plant.system.cart_kg=1.0") for assignment in assignments or ())
+    return dict(settings_of(assignments or (), "plant.system.cart_kg=1.0"))
 
 
 def _allowed(assignments: Sequence[str] | None) -> dict[str, float] | None:
@@ -197,6 +197,8 @@ def _allowed(assignments: Sequence[str] | None) -> dict[str, float] | None:
     allowed = {}
     for text in assignments:
         name, _, value = text.partition("=")
+        if name in allowed:
+            raise CallerError(f"--allow {name}: is given twice")
         try:
             allowed[name] = float(value)
         except ValueError:

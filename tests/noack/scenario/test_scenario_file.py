@@ -235,3 +235,34 @@ def test_every_reader_refuses_large_files_deep_tables_and_long_integers(
     path.write_text(f"link = 1\naxes = 1\nmodel = 1\n{text}")  # as each reader expects
     with pytest.raises(CallerError, match=f"^[^\n]*file.toml: {wrong}[^\n]*$"):
         read(path)
+
+
+@pytest.mark.parametrize("key", ["controller.reference", "trigger.floor", "controller.update_timeout_s"])
+def test_none_takes_a_key_out_that_may_be_absent(key: str) -> None:
+    path = next(path for path in SHIPPED if path.stem == "servo_reference")
+    section, _, field = key.partition(".")
+    default = type(getattr(load(path), section)).model_fields[field].get_default(call_default_factory=True)
+    assert getattr(getattr(load(path, [f"{key}=none"]), section), field) == default
+
+
+def test_none_takes_an_entry_out_and_a_text_in_quotes_stays() -> None:
+    path = next(path for path in SHIPPED if path.stem == "servo_reference")
+    entries = 'network.impairments=[{kind="delay", delay_s=0.001}, {kind="loss", model="lossless"}]'
+    content = tomllib.loads(path.read_text())
+    put(content, "network.impairments", value_of(entries.partition("=")[2], ""), "")
+    put(content, "network.impairments.0", None, "")
+    assert [entry["kind"] for entry in content["network"]["impairments"]] == ["loss"]
+    assert load(path, ['description="none"']).description == "none"
+
+
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [
+        (["trigger.flor=none"], "--set trigger.flor: unknown key; did you mean trigger.floor?"),
+        (["beta=1", "trigger.beta=2"], "--set trigger.beta: is given twice"),
+        (["trigger.beta=none"], "--set trigger.beta: missing"),
+    ],
+)
+def test_a_key_that_cannot_be_taken_out_and_one_set_twice(settings: list[str], line: str) -> None:
+    with pytest.raises(CallerError, match=re.escape(line)):
+        load(SHIPPED[0].with_name("servo_reference.toml"), settings)
