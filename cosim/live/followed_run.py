@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 from zenoh.handlers import RingChannel
 
 from cosim.record.run_directory import SCENARIO_FILE
-from noack.core.errors import CallerError, PeerError
+from noack.core.errors import CallerError, PeerError, did_you_mean
 from noack.protocol.record_tables import LOOP
 from noack.runtime.active_runs import RUNS, OpenRun, active_runs, find_run
 from noack.runtime.connections.zenoh_session import cause_of, header_of, open_session
+from noack.runtime.control_messages import LogLine, parse_message
+from noack.runtime.spool import NOTICES, lines_in
 from noack.scenario import scenario_file
 from noack.scenario.resolution import ResolvedRun, loop_of
 
+_NOTICE = np.dtype([("t_ns", np.int64), ("level", object), ("text", object), ("process", object)])
 _WAITING_BATCHES = 4096
 _POLL_S, _LOOK_S = 0.005, 0.5
 """Waits for rows, and for the end of the run."""
@@ -45,9 +48,11 @@ class LiveRows(NamedTuple):
 
     table: str
     """Name of the table; ``docs/record.md`` has them."""
-    loop: FollowedLoop
+    loop: FollowedLoop | None
+    """None: notices about the whole run, in its time."""
     rows: NDArray[np.void]
-    """A structured array; times are those of the loop."""
+    """A structured array; times are those of the loop. That of ``notices`` has the fields ``t_ns``,
+    ``level``, ``text`` and ``process``."""
 
 
 class FollowedRun:
@@ -67,14 +72,29 @@ class FollowedRun:
         """Its loops."""
 
     def rows(self, *tables: str) -> Iterator[LiveRows]:
-        """Yield the rows of some tables, from now to the end of the run.
+        """Return an iterator of the rows of some tables, from now to the end of the run.
 
         Each process sends a batch every 50 ms at most. Of each process and table the rows are in
         order. Who is slower than the run misses the oldest ones; the recorder has them all.
 
+        Args:
+            tables: names of tables of the record, or ``notices``: the lines of the processes for the
+                run's log. The recorder's own lines are in the record only.
+
         Raises:
+            CallerError: there is no such table.
             NoackError: the run cannot be reached.
         """
+        known = [*self._types, NOTICES]
+        for table in tables:
+            if table not in known:
+                hint = did_you_mean(table, known) or f"the tables are {', '.join(known)}"
+                raise CallerError(f"{table}: a run has no such table; {hint}")
+        if not tables:
+            raise CallerError(f"name the tables to follow; a run has {', '.join(known)}")
+        return self._batches(tables)
+
+    def _batches(self, tables: tuple[str, ...]) -> Iterator[LiveRows]:
         with ExitStack() as stack:
             try:
                 session = stack.enter_context(open_session(RUNS, self._run.name, listen=False))
@@ -96,12 +116,23 @@ class FollowedRun:
                 time.sleep(_POLL_S)
 
     def _rows_of(self, sample: zenoh.Sample, tables: tuple[str, ...]) -> Iterator[LiveRows]:
-        table = str(sample.key_expr).rpartition("/")[2]
+        role, table = str(sample.key_expr).split("/")[-2:]
         if table not in tables or header_of(sample) is None:
+            return
+        if table == NOTICES:
+            yield from self._notices(role, sample.payload.to_bytes())
             return
         rows = np.frombuffer(sample.payload.to_bytes(), self._types[table])
         for loop in np.unique(rows[LOOP]).tolist():
             yield LiveRows(table, self.loops[loop], rows[rows[LOOP] == loop])
+
+    def _notices(self, process: str, batch: bytes) -> Iterator[LiveRows]:
+        """Yield each line of a batch for the log."""
+        for text in lines_in(batch):
+            line = parse_message(LogLine, text)
+            loop = line.loop if line.loop is not None or len(self.loops) > 1 else 0
+            row = np.array([(line.t_ns, line.level, line.text, process)], _NOTICE)
+            yield LiveRows(NOTICES, None if loop is None else self.loops[loop], row)
 
 
 def follow(directory: str | Path, *, timeout_s: float = 30.0) -> FollowedRun:

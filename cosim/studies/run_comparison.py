@@ -1,5 +1,6 @@
 """A comparison of runs: key numbers, settings that differ, distances, and one overlaid figure."""
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,7 +28,7 @@ from cosim.output.figures.panels import Panels
 from cosim.output.result_tables import ResultTable
 from cosim.output.run_tables import caps_text
 from cosim.record.align import Reals, Times, align_tables
-from cosim.record.run_directory import chosen_run
+from cosim.record.run_directory import chosen_run, require_output
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, shortened
@@ -120,6 +121,11 @@ class RunComparison:
             if len(set(values)) > 1 and not key.startswith(_NAMES_ONLY)
         }
 
+    @property
+    def default_file(self) -> Path:
+        """Where the page is written unless another file is named: beside the first run."""
+        return Path(os.path.relpath(self.runs[0].directory.resolve().parent)) / "comparison.html"
+
     def plot(self) -> "Figure":
         """Draw states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions of all runs overlaid."""
         return overlay_figure(self.runs).draw()
@@ -139,6 +145,7 @@ class RunComparison:
         from cosim.output.page_kit import save_page
 
         path = Path(path)
+        require_output(path)
         if path.suffix in FIGURE_SUFFIXES:
             save_figure(overlay_figure(self.runs), path, width)
             return

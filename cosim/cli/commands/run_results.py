@@ -174,12 +174,13 @@ def compare(
         ),
     ],
     out: Annotated[
-        Path,
+        Path | None,
         Option(
             callback=opt.usable_path,
-            help="File of the overlay: a page (.html), or a figure (.svg, .png, .pdf).",
+            help="File of the overlay: a page (.html), or a figure (.svg, .png, .pdf); by default "
+            "comparison.html beside the first run.",
         ),
-    ] = DEFAULT_RUNS / "comparison.html",
+    ] = None,
     width: opt.WidthOption = None,
     json: opt.JsonOption = False,
 ) -> None:
@@ -191,10 +192,11 @@ def compare(
 
     with status("comparing"):
         comparison = compare_runs(directories)
-        comparison.save(out, width)
-    show(comparison.document, json=json, overlay=str(out))
+        file = comparison.default_file if out is None else out
+        comparison.save(file, width)
+    show(comparison.document, json=json, overlay=str(file))
     if not json:
-        print(f"overlay: {out}")
+        print(f"overlay: {file}")
 
 
 @app.command(

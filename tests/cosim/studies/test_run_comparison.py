@@ -1,6 +1,7 @@
 """Comparison of runs: numbers, settings, distance, one figure; and runs that cannot be compared."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,22 @@ def test_the_command_prints_the_table_and_writes_an_escaped_page(runs: list[Path
     mine = noack.compare(*map(noack.open_run, runs))
     assert mine.rows == compare_runs(runs).rows
     assert "distance in x to A, RMS" in repr(mine)
+
+
+def test_the_page_is_written_beside_the_first_run(
+    runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    first, second = tmp_path / "first/A", tmp_path / "second/B"
+    for run, copy in zip(runs, (first, second), strict=False):
+        shutil.copytree(run, copy)
+    result = compare("../first/A", second)
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines()[-1] == "overlay: ../first/comparison.html"
+    assert sorted(path.name for path in first.parent.iterdir()) == ["A", "comparison.html"]
+    assert not [*here.iterdir()]
 
 
 def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: Path) -> None:
