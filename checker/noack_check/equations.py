@@ -10,6 +10,11 @@ exchanged: that with the narrower result is used. For a function with a derivati
 φ(g) − φ(g₀) = (g − g₀) ∫₀¹ φ'(g₀ + s (g − g₀)) ds, and the integral is in the mean of enclosures of φ' for
 slices of s.
 
+Each step has to be finite and defined on the whole region: then the equations are, whatever a later step
+multiplies it by. A root needs a number that is not negative: by its enclosure, or because it is made of
+squares, sizes, exponentials and numbers that are not. If it is a sum of squares, g = ‖h‖² with h in the
+region's balls, then its root is ‖h‖, with the slopes ∫₀¹ v_k/‖v‖ ds ∈ [−1, 1], v = h₀ + s (h − h₀).
+
 A sign, tanh, arctan or saturation of y = Cz grows with y, and is bounded. With the least and the largest
 slope l and h of its chords from 0 it is l y + v p, with an unknown signal p, |p| ≤ 1, which is one more
 entry of z, and v p y ≥ (v p)²/(h − l). So friction is known to be at most its size, and to take energy
@@ -37,10 +42,26 @@ _LONGEST_S = 1e9
 _NARROW = 1e-25
 """An entry that varies by less, relatively, stays a ball, which rounding left; others have half-widths."""
 _MOST_POWER = 100
+_MOST_SQUARES = 100
+_LARGEST = 1e300
+"""A step that may be larger overflows in floating point."""
+_UNDEFINED = {
+    "log": "log of a number that may be 0 or negative",
+    "power": "division by, or power of, a number that may be 0 or negative",
+    "root": "root of a number that may be negative",
+    "tan": "tan of an angle that may be π/2",
+}
 
 
 class UndecidedError(RejectedError):
     """Equations distinguish cases, of which the region has more than one."""
+
+
+class UndefinedError(RejectedError):
+    """A step is not proven to be finite and defined on the whole region."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"its equations are not finite on the whole region: {reason}")
 
 
 class Enclosed(NamedTuple):
@@ -50,6 +71,15 @@ class Enclosed(NamedTuple):
     slopes: tuple[arb, ...]
     rest: arb
     value: arb
+    is_nonnegative: bool = False
+    """g ≥ 0 by its form: a ball around [0, g] begins below 0."""
+    squares: tuple["Enclosed", ...] = ()
+    """g is the sum of the squares of these; empty: it is not known as such a sum."""
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether g does not depend on z."""
+        return all(slope == 0 for slope in self.slopes) and bool(self.rest == 0)
 
 
 class LinearPlants(NamedTuple):
@@ -85,13 +115,40 @@ class Evaluation:
         Raises:
             RejectedError: there is no such function, or it does not have such operands.
             UndecidedError: what a case requires is not proven.
+            UndefinedError: it is not proven to be finite on the whole region.
         """
         shape = len(operands), len(numbers)
         if name in _FUNCTIONS and shape == (1, 0):
-            return self._function(operands[0], *_FUNCTIONS[name])
-        if name not in _SHAPES or _SHAPES[name] != shape:
+            term = self._function(operands[0], *_FUNCTIONS[name])
+        elif name in _SHAPES and _SHAPES[name] == shape:
+            term = getattr(self, f"_{name}")(*operands, *numbers)
+        else:
             raise RejectedError(f"equations: {name[:50]!r} is no step of such a shape")
-        return getattr(self, f"_{name}")(*operands, *numbers)  # type: ignore[no-any-return]
+        if term.value.is_nan():
+            raise UndefinedError(_UNDEFINED.get(name, name))
+        if not all(ball.abs_upper() < _LARGEST for ball in (term.centre, *term.slopes, term.rest)):
+            raise UndefinedError(f"{name} may be too large")
+        return term._replace(
+            is_nonnegative=_is_nonnegative(name, operands, numbers),
+            squares=self._squares(name, operands, numbers)[:_MOST_SQUARES],
+        )
+
+    def _squares(
+        self, name: str, operands: Sequence[Enclosed], numbers: Sequence[float | None]
+    ) -> tuple[Enclosed, ...]:
+        """Return terms whose squares add up to a step; none: no such terms are known."""
+        if name == "power" and numbers[0] == 2:
+            return (operands[0],)
+        if name == "number" and (value := read_number({"number": numbers[0]}, "number")) >= 0:
+            return (self._constant(value.sqrt()),)
+        if name == "add" and all(operand.squares for operand in operands):
+            return operands[0].squares + operands[1].squares
+        if name == "times":
+            for factor, other in (operands, operands[::-1]):
+                if factor.is_constant and factor.centre >= 0:
+                    root = self._constant(factor.centre.sqrt())
+                    return tuple(self._times(root, term) for term in other.squares)
+        return ()
 
     def _state(self, index: float) -> Enclosed:
         return self._coordinate(index, 0, self.n)
@@ -126,7 +183,9 @@ class Evaluation:
 
     def _times(self, a: Enclosed, b: Enclosed) -> Enclosed:
         """Return the product, in the form whose slopes and rest are the narrower ones."""
-        forms = [self._product(a, b), self._product(b, a)]
+        return self._narrowest([self._product(a, b), self._product(b, a)])
+
+    def _narrowest(self, forms: Sequence[Enclosed]) -> Enclosed:
         return min(forms, key=lambda form: float(self._width(form).upper()))
 
     def _product(self, a: Enclosed, b: Enclosed) -> Enclosed:
@@ -151,20 +210,40 @@ class Evaluation:
         return self._function(a, lambda g: _power(g, power), lambda g: power * _power(g, power - 1))
 
     def _root(self, a: Enclosed) -> Enclosed:
-        """Return √max(g, 0): the slope of its chord is 1/(√g + √g₀), and √g₀/(g₀ − g) where g < 0."""
+        """Return √g: the slope of its chord is 1/(√g + √g₀), or √g is the norm of the squares in g."""
 
         def root(g: arb) -> arb:
             return _at_ends(g, lambda end: end.max(arb(0)).sqrt())
 
-        if not a.centre > 0:
-            if all(slope == 0 for slope in a.slopes) and a.rest == 0:
-                return self._constant(root(a.centre))
-            raise RejectedError("its equations are not defined and smooth in all of the region")
-        first = a.centre.sqrt()
-        chord = 1 / (root(a.value) + first)
-        if not a.value >= 0:
-            chord = chord.union(first / (a.centre - a.value.lower()))
-        return self._by_chord(a, root, chord)
+        if not (a.is_nonnegative or a.value >= 0):
+            raise UndefinedError(_UNDEFINED["root"])
+        if a.is_constant:
+            return self._constant(root(a.centre))
+        forms = []
+        if a.squares:
+            forms.append(self._norm(a.squares, root(a.value)))
+        if a.centre > 0:
+            forms.append(self._by_chord(a, root, 1 / (root(a.value) + a.centre.sqrt())))
+        if not forms:
+            raise UndefinedError("root of a number that may be 0 at x = 0: its slope is infinite there")
+        return self._narrowest(forms)
+
+    def _norm(self, squares: Sequence[Enclosed], value: arb) -> Enclosed:
+        """Return the root of a sum of squares, which has this value over the region."""
+        changes = [_both(h.value - h.centre, self._change(h)) for h in squares]
+        slopes = [arb(0)] * len(squares)
+        for part in _slices():
+            v = [h.centre + _times(part, change) for h, change in zip(squares, changes, strict=True)]
+            size = arb(sum((_power(entry, 2) for entry in v), arb(0)).lower()).max(arb(0)).sqrt()
+            for k, entry in enumerate(v):
+                slopes[k] += _between_ones(entry / size if size > 0 else arb.nan()) / _SLICES
+        pairs = list(zip(slopes, squares, strict=True))
+        centre = sum((_power(h.centre, 2) for h in squares), arb(0)).sqrt()
+        combined = [
+            sum((_times(slope, h.slopes[k]) for slope, h in pairs), arb(0)) for k in range(len(self._z))
+        ]
+        rest = sum((_times(slope, h.rest) for slope, h in pairs), arb(0))
+        return self._term(centre, combined, rest, value)
 
     def _by_chord(self, a: Enclosed, value: Callable[[arb], arb], chord: arb) -> Enclosed:
         """Return a function with these slopes of chords from g₀."""
@@ -259,15 +338,14 @@ class Evaluation:
     def _function(
         self, a: Enclosed, value: Callable[[arb], arb], derivative: Callable[[arb], arb]
     ) -> Enclosed:
-        if all(slope == 0 for slope in a.slopes) and a.rest == 0:
+        if a.is_constant:
             return self._constant(value(a.centre))
         return self._by_chord(a, value, self._mean_slope(a, derivative))
 
     def _mean_slope(self, a: Enclosed, derivative: Callable[[arb], arb]) -> arb:
         """Enclose the slopes of chords from g₀ to g."""
         change = _both(a.value - a.centre, self._change(a))
-        slices = [arb((k + 0.5) / _SLICES, 0.5 / _SLICES) for k in range(_SLICES)]
-        slopes = [derivative(a.centre + _times(part, change)) for part in slices]
+        slopes = [derivative(a.centre + _times(part, change)) for part in _slices()]
         return sum(slopes, arb(0)) / _SLICES
 
     def _change(self, a: Enclosed) -> arb:
@@ -279,17 +357,11 @@ class Evaluation:
         return term._replace(value=_both(value, centre + self._change(term)))
 
     def plants(self, rates: Sequence[Enclosed]) -> LinearPlants:
-        """Return the plants that have these rates ẋ.
-
-        Raises:
-            RejectedError: a rate is not bounded in the region.
-        """
+        """Return the plants that have these rates ẋ."""
         n, states = self.n, self.n + self.m
         centre, half = arb_mat(n, len(self._z)), arb_mat(n, len(self._z))
         rests = []
         for i, rate in enumerate(rates):
-            if not all(ball.is_finite() for ball in (*rate.slopes, rate.centre + rate.rest)):
-                raise RejectedError("its equations are not defined and smooth in all of the region")
             largest = frobenius(arb_mat(1, len(rate.slopes), [slope.abs_upper() for slope in rate.slopes]))
             for k, slope in enumerate(rate.slopes):
                 is_narrow = bool(slope.rad() <= _NARROW * largest)
@@ -319,15 +391,40 @@ class Evaluation:
         )
 
 
+def _is_nonnegative(name: str, operands: Sequence[Enclosed], numbers: Sequence[float | None]) -> bool:
+    """Return whether a step is at least 0 by its form, in floating point, too."""
+    if name in ("add", "times"):
+        return all(operand.is_nonnegative for operand in operands)
+    if name == "number":
+        return bool(read_number({"number": numbers[0]}, "number") >= 0)
+    if name == "power":
+        return operands[0].is_nonnegative or float(numbers[0] or 0) % 2 == 0
+    if name == "clip":
+        low, high = numbers
+        return (operands[0].is_nonnegative or (low is not None and low >= 0)) and (high is None or high >= 0)
+    return name in _NONNEGATIVE
+
+
+def _slices() -> list[arb]:
+    """Return balls that cover [0, 1]."""
+    return [arb((k + 0.5) / _SLICES, 0.5 / _SLICES) for k in range(_SLICES)]
+
+
+def _between_ones(g: arb) -> arb:
+    """Return the numbers of a ball that are in [−1, 1]."""
+    ones = arb(0, 1)
+    return g.intersection(ones) if g.is_finite() and g.overlaps(ones) else ones
+
+
 def _times(a: arb, b: arb) -> arb:
     """Return a product, in which 0 times any number is 0."""
     return arb(0) if a.is_zero() or b.is_zero() else a * b
 
 
 def _both(a: arb, b: arb) -> arb:
-    """Return numbers that are in both balls."""
+    """Return numbers that are in both balls; NaN, what is not defined, if the first one is."""
     if not (a.is_finite() and b.is_finite()):
-        return a if a.is_finite() else b
+        return a if a.is_finite() or a.is_nan() else b
     return a.intersection(b)
 
 
@@ -378,6 +475,7 @@ _FUNCTIONS: Mapping[str, tuple[Callable[[arb], arb], Callable[[arb], arb]]] = {
     "abs": (_size, _slope_of_size),
 }
 """Functions with their derivatives."""
+_NONNEGATIVE = ("abs", "exp", "cosh", "root", "time")
 _SHAPES = {
     "state": (0, 1), "input": (0, 1), "number": (0, 1), "time": (0, 0), "add": (2, 0), "times": (2, 0),
     "negative": (1, 0), "power": (1, 1), "clip": (1, 2), "sign": (1, 0), "positive": (1, 0),
@@ -467,5 +565,5 @@ def _formula(name: str, rest: Sequence[object], texts: Sequence[str]) -> str:
     if name in ("positive", "nonnegative"):
         return operands[0]
     if name == "root":
-        return f"√max({operands[0]}, 0)"
+        return f"√{operands[0]}"
     return f"{name}({', '.join([*operands, *map(str, rest[count:])])})"

@@ -175,6 +175,7 @@ _NUMPY_OF_MATH = {
     for name in dir(math)
     if hasattr(np, _OTHER_NAMES.get(name, name)) and not name.startswith("_") and name != "remainder"
 }
+_NUMPY_OF_MATH["hypot"] = lambda *entries: np.sqrt(sum(entry * entry for entry in entries))
 
 
 @contextmanager

@@ -10,17 +10,24 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from noack.core.errors import NoackError, one_line
+from noack.core.errors import NoackError, one_line, shortened
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import PlantSystem
 from noack_check.balls import number
 from noack_check.check import RejectedError
-from noack_check.equations import SIGNALS, Enclosed, Evaluation, LinearPlants, enclose
+from noack_check.equations import (
+    SIGNALS,
+    Enclosed,
+    Evaluation,
+    LinearPlants,
+    UndefinedError,
+    enclose,
+    formulas,
+)
 from noack_check.loop import Region
 
 Operand: TypeAlias = "TracedNumber | float"
 _MOST_SIGNALS = 16
-_ROUNDING = 1e-6
 _FUNCTIONS = ("sin", "cos", "tan", "arctan", "tanh", "sinh", "cosh", "exp", "log", "sign")
 _NUMPY = {name: name for name in _FUNCTIONS} | {"absolute": "abs", "fabs": "abs"}
 _OPERATORS = {
@@ -28,7 +35,7 @@ _OPERATORS = {
     "true_divide": "__truediv__", "power": "__pow__", "float_power": "__pow__", "less": "__lt__",
     "less_equal": "__le__", "greater": "__gt__", "greater_equal": "__ge__",
 }  # fmt: skip
-_KNOWN_FUNCTIONS = f"{', '.join(_FUNCTIONS)}, sqrt, abs, clip, minimum, maximum, radians and degrees"
+_KNOWN_FUNCTIONS = f"{', '.join(_FUNCTIONS)}, sqrt, hypot, abs, clip, minimum, maximum, radians and degrees"
 
 
 class NotEnclosedError(NoackError):
@@ -156,8 +163,11 @@ class TracedNumber:
 
     def sqrt(self) -> "TracedNumber":
         """See :func:`numpy.sqrt`."""
-        self._trace.require_root(self)
         return self._step("root")
+
+    def hypot(self, other: Operand) -> "TracedNumber":
+        """See :func:`numpy.hypot`."""
+        return (self**2 + self._trace.traced(other) ** 2).sqrt()
 
     def radians(self) -> "TracedNumber":
         """See :func:`numpy.radians`."""
@@ -244,6 +254,9 @@ class _Trace:
                 self.enclosed.append(
                     self.evaluation.step(name, [self.enclosed[index] for index in indices], numbers)
                 )
+            except UndefinedError as error:
+                [text] = formulas({"steps": self.steps, "rates": indices[:1]})
+                raise NotEnclosedError(f"{error}: {shortened(text)}") from None
             except RejectedError as error:
                 raise NotEnclosedError(str(error)) from None
             self.steps.append([name, *indices, *numbers])
@@ -261,12 +274,6 @@ class _Trace:
             self.add("nonnegative", [opposite])
             return False
         return True
-
-    def require_root(self, value: TracedNumber) -> None:
-        """Require that a number is not negative, but for rounding."""
-        enclosed = self.enclosed[value.index].value
-        if not enclosed.lower() >= -_ROUNDING * enclosed.abs_upper():
-            raise NotEnclosedError("its equations have the root of a number that is negative in the region")
 
     def is_coordinate(self, value: object, index: int) -> bool:
         """Return whether a number is the entry of z, plus a constant that is 0 but for rounding."""
