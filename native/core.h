@@ -71,6 +71,7 @@ typedef struct {
     int64_t state;          /* of a Markov chain, or 1: a score is stored */
     int64_t taken_until_ns; /* the slots of a schedule that begin before this time are taken */
     double score;           /* of the packet before */
+    int64_t delayed;        /* reorder: packets since the last one that left at once */
 } noack_stage_memory;
 
 /* A stage's state that all flows share: of a queue, whose departure times lie in a ring, or of a
@@ -129,39 +130,69 @@ struct noack_link {
     noack_counters counters;
 };
 
+/* A packet is copied at most once. Each copy passes the later stages by itself. */
+enum { ORIGINAL, DUPLICATE, COPIES };
+
+/* One of the copies of a packet, between two stages. */
+typedef struct {
+    int exists;      /* 0: it is lost, or was never made */
+    int64_t time_ns; /* when it has passed the stages so far */
+    int64_t bit;     /* the bit that is flipped; -1: none */
+    double score; /* normal score of the link's state, for a delay that is correlated with loss */
+} packet_copy;
+
 /* A packet for which a link decides, seen by a stage. */
 typedef struct {
     noack_link *link;
     noack_flow *flow;
     noack_decision *decision;
     int64_t stage; /* its number */
+    int copy;      /* the copy on which the stage acts */
+    packet_copy copies[COPIES];
 } packet;
 
 typedef void stage_function(packet *packet, const noack_stage *stage, noack_stage_memory *memory);
 
 /* Stages are called for every packet of a flow, lost or not, so that a stage's random draws do not
-   depend on other stages. */
+   depend on other stages. For a duplicate they are called once more, as if it were the flow's next
+   packet; but later draws do not depend on that. */
 stage_function apply_bernoulli, apply_four_state, apply_gilbert_elliott, apply_periodic,
     apply_scripted, apply_worst_case, apply_tail_drop, apply_blackout, apply_corrupt, apply_delay,
     apply_duplicate, apply_earliest_deadline, apply_maximum_error, apply_opportunities,
     apply_priority, apply_reorder, apply_replay, apply_schedule;
 
-/* Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost already or must pass. What
-   becomes of its times and its datagram: keep_limit in link.c. */
-static inline void lose(noack_decision *decision, int64_t fate) {
-    if (decision->fate != NOACK_DELIVERED)
-        return;
-    if (decision->must_pass)
-        decision->loss_suppressed = 1;
-    else
-        decision->fate = fate;
+/* The copy on which a stage acts. */
+static inline packet_copy *copy_in(packet *packet) { return &packet->copies[packet->copy]; }
+
+/* Whether a packet that must pass has no other intact copy than this one. */
+static inline int is_needed(const packet *packet) {
+    const packet_copy *copy = &packet->copies[packet->copy];
+    const packet_copy *other = &packet->copies[COPIES - 1 - packet->copy];
+    return packet->decision->must_pass && copy->exists && copy->bit < 0
+           && !(other->exists && other->bit < 0);
 }
 
-/* Two uniform numbers in [0, 1) of a stage for a packet; block numbers the pairs. */
+/* Lose the copy on which a stage acts by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost
+   already or needed. The packet has the fate of its last copy. */
+static inline void lose(packet *packet, int64_t fate) {
+    if (is_needed(packet)) {
+        packet->decision->loss_suppressed = 1;
+    } else if (copy_in(packet)->exists) {
+        copy_in(packet)->exists = 0;
+        if (!packet->copies[COPIES - 1 - packet->copy].exists)
+            packet->decision->fate = fate;
+    }
+}
+
+enum { MOST_DRAWS = 2 }; /* pairs of numbers that a stage needs for a copy */
+
+/* Two uniform numbers in [0, 1) of a stage for the copy on which it acts; block numbers the pairs.
+ */
 static inline void draw(
     const packet *packet, const noack_stage *stage, int64_t block, double uniform[2]) {
     noack_uniforms(
-        stage->key0, stage->key1, packet->flow->number, packet->decision->packet, block, uniform);
+        stage->key0, stage->key1, packet->flow->number, packet->decision->packet,
+        packet->copy * MOST_DRAWS + block, uniform);
 }
 
 /* The first place in [begin, end) with a number above value; else end. The numbers ascend. */
@@ -231,7 +262,7 @@ int64_t flow_table_entry(const packet *packet, const noack_stage *stage);
    of which those with the same leave in order of arrival. */
 void enter_queue(packet *packet, int64_t key, int is_time);
 /* Complete the decision for a packet that has entered, when all stages have seen it. */
-void complete_waiting_decision(noack_decision *decision);
+void complete_waiting_decision(packet *packet);
 /* Let a stored datagram, of whose link the decision is, wait until the link is free. */
 void wait_for_link(
     noack_link *link, int64_t row, noack_waiting *waiting, int64_t place, int64_t order,

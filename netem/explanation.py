@@ -268,6 +268,8 @@ def tc_command(settings: LinkSettings, written: LinkSettings | None = None) -> T
     order = [_FIXED_ORDER.index(kind) for kind in kinds if kind in _FIXED_ORDER]
     if order != sorted(order):
         notes.append(f"its order is fixed: {', '.join(_FIXED_ORDER)}")
+    if "duplicate" in kinds and "loss" in kinds:
+        notes.append("a packet that it duplicates is never lost: a loss takes only one of the two copies")
     return TcCommand(text, tuple(lacks), tuple(dict.fromkeys(notes)))
 
 

@@ -6,8 +6,8 @@ void apply_bernoulli(packet *packet, const noack_stage *stage, noack_stage_memor
     double uniform[2];
     draw(packet, stage, 0, uniform);
     if (happens(chance, memory, uniform[0]))
-        lose(packet->decision, NOACK_DROPPED);
+        lose(packet, NOACK_DROPPED);
     if (chance->scored) /* for a delay that is correlated with loss */
-        packet->flow->score =
+        copy_in(packet)->score =
             chance->correlation == 0.0 ? -noack_normal_score(uniform[0]) : memory->score;
 }

@@ -47,11 +47,11 @@ double noack_delay_quantile_ns(const noack_delay *delay, const double *reals, do
    correlation with the loss model's score s, z = rho s + sqrt(1 - rho^2) z', and the delay is the
    quantile at Phi(z). */
 static int64_t draw_delay_ns(
-    const noack_delay *settings, const packet *packet, noack_stage_memory *memory, double u) {
+    const noack_delay *settings, packet *packet, noack_stage_memory *memory, double u) {
     if (settings->correlation != 0.0 || settings->loss_correlation != 0.0) {
         double z = latent(settings->correlation, settings->innovation, memory, u);
         if (settings->loss_correlation != 0.0)
-            z = settings->loss_correlation * packet->flow->score + settings->loss_innovation * z;
+            z = settings->loss_correlation * copy_in(packet)->score + settings->loss_innovation * z;
         u = fmin(noack_normal_cdf(z), 0.9999999999999999);
     }
     double delay_ns =
@@ -59,15 +59,8 @@ static int64_t draw_delay_ns(
     return (int64_t)fmin(fmax(delay_ns, 0.0), LONGEST_NS);
 }
 
-/* Delay the packet and its copy; the copy's delay is drawn as if it were the next packet. */
 void apply_delay(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
-    noack_decision *decision = packet->decision;
     double uniform[2];
     draw(packet, stage, 0, uniform);
-    decision->release_ns += draw_delay_ns(&stage->delay, packet, memory, uniform[0]);
-    if (decision->copy_ns != NOACK_NEVER_NS) {
-        noack_stage_memory latest = *memory; /* the next packet's must not depend on a copy */
-        decision->copy_ns += draw_delay_ns(&stage->delay, packet, memory, uniform[1]);
-        *memory = latest;
-    }
+    copy_in(packet)->time_ns += draw_delay_ns(&stage->delay, packet, memory, uniform[0]);
 }

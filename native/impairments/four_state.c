@@ -28,5 +28,5 @@ void apply_four_state(packet *packet, const noack_stage *stage, noack_stage_memo
     }
     memory->state = state - 1;
     if (state >= 3)
-        lose(packet->decision, NOACK_DROPPED);
+        lose(packet, NOACK_DROPPED);
 }

@@ -31,7 +31,7 @@ void apply_gilbert_elliott(packet *packet, const noack_stage *stage, noack_stage
     draw(packet, stage, 0, uniform);
     if (settings->step_ns > 0) {
         noack_stage_state *common = &packet->link->stage_states[packet->stage];
-        change_state(settings, common, packet->decision->arrival_ns, uniform[0]);
+        change_state(settings, common, copy_in(packet)->time_ns, uniform[0]);
         memory->state = common->state;
     } else if (memory->state == BAD) {
         if (uniform[0] < settings->bad_to_good)
@@ -42,9 +42,9 @@ void apply_gilbert_elliott(packet *packet, const noack_stage *stage, noack_stage
     if (settings->scored) {
         draw(packet, stage, 1, other);
         double bad = settings->share_bad;
-        packet->flow->score = -noack_normal_score(
+        copy_in(packet)->score = -noack_normal_score(
             memory->state == BAD ? other[0] * bad : bad + other[0] * (1.0 - bad));
     }
     if (uniform[1] < (memory->state == BAD ? settings->loss_in_bad : settings->loss_in_good))
-        lose(packet->decision, NOACK_DROPPED);
+        lose(packet, NOACK_DROPPED);
 }

@@ -83,25 +83,19 @@ static int64_t carry_packet(
     return queue->busy_until_ns;
 }
 
-/* Put the packet and then its copy into the queue; ignore a packet that is lost already. */
+/* Put the packet into the queue; ignore a packet that is lost already. */
 void apply_opportunities(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;
-    noack_decision *decision = packet->decision;
-    if (decision->fate != NOACK_DELIVERED)
+    packet_copy *copy = copy_in(packet);
+    if (!copy->exists)
         return;
     noack_stage_state *queue = &packet->link->stage_states[packet->stage];
     const int64_t *times_ms = packet->link->integers;
     int64_t *ring = packet->link->departures_ns;
-    int64_t line_bytes = max_of(decision->size_bytes + stage->opportunities.overhead_bytes, 1);
-    if (!has_room(stage, queue, ring, line_bytes, decision->release_ns))
-        lose(decision, NOACK_OVERFLOWED);
-    if (decision->fate == NOACK_DELIVERED)
-        decision->release_ns = carry_packet(stage, times_ms, queue, ring, line_bytes);
-    if (decision->copy_ns == NOACK_NEVER_NS)
-        return;
-    if (decision->fate == NOACK_DELIVERED
-        && has_room(stage, queue, ring, line_bytes, decision->copy_ns))
-        decision->copy_ns = carry_packet(stage, times_ms, queue, ring, line_bytes);
-    else
-        decision->copy_ns = NOACK_NEVER_NS;
+    int64_t line_bytes =
+        max_of(packet->decision->size_bytes + stage->opportunities.overhead_bytes, 1);
+    if (!has_room(stage, queue, ring, line_bytes, copy->time_ns))
+        lose(packet, NOACK_OVERFLOWED);
+    if (copy->exists)
+        copy->time_ns = carry_packet(stage, times_ms, queue, ring, line_bytes);
 }

@@ -6,5 +6,5 @@ void apply_periodic(packet *packet, const noack_stage *stage, noack_stage_memory
     const noack_periodic *settings = &stage->periodic;
     int64_t number = packet->decision->packet - settings->first;
     if (number >= 0 && number % settings->period < settings->burst)
-        lose(packet->decision, NOACK_DROPPED);
+        lose(packet, NOACK_DROPPED);
 }

@@ -35,28 +35,25 @@ static int64_t delay_at(const noack_replay *settings, const int64_t *table, int6
            + part_of(table[settings->begin + high] - delay_ns, elapsed_ns - sent_ns, gap_ns);
 }
 
-/* Lose or delay the packet, and its copy, as recorded. */
+/* Lose or delay the packet as recorded. */
 void apply_replay(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;
     const noack_replay *settings = &stage->replay;
     const int64_t *table = packet->link->integers;
-    noack_decision *decision = packet->decision;
     int64_t delay_ns = 0;
     if (settings->period_ns > 0) {
-        int64_t elapsed_ns = decision->arrival_ns + settings->offset;
+        int64_t elapsed_ns = copy_in(packet)->time_ns + settings->offset;
         if (!settings->once || (0 <= elapsed_ns && elapsed_ns < settings->period_ns))
             delay_ns = delay_at(settings, table, floor_mod(elapsed_ns, settings->period_ns));
     } else {
-        int64_t record = decision->packet + settings->offset,
+        int64_t record = packet->decision->packet + settings->offset,
                 count = settings->end - settings->begin;
         if (!settings->once || record < count)
             delay_ns = table[settings->begin + record % count];
     }
     if (delay_ns < 0) {
-        lose(decision, NOACK_DROPPED);
+        lose(packet, NOACK_DROPPED);
         delay_ns = -1 - delay_ns;
     }
-    decision->release_ns += delay_ns;
-    if (decision->copy_ns != NOACK_NEVER_NS)
-        decision->copy_ns += delay_ns;
+    copy_in(packet)->time_ns += delay_ns;
 }

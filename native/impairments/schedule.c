@@ -48,26 +48,20 @@ static int64_t take_turn(const turns *turns, noack_stage_memory *memory, int64_t
     return begin_ns;
 }
 
-/* Take slots for the packet and then for its copy; ignore a packet that is lost already. */
+/* Take a slot; ignore a packet that is lost already. */
 void apply_schedule(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
-    noack_decision *decision = packet->decision;
+    packet_copy *copy = copy_in(packet);
     const int64_t *firsts = packet->link->integers + stage->schedule.begin;
     int64_t row = packet->flow - packet->link->flows, flows = stage->schedule.flows;
     turns turns = {&stage->schedule, firsts + flows + 1, 0};
-    if (decision->fate != NOACK_DELIVERED)
+    if (!copy->exists)
         return;
     if (row < flows) {
         turns.slots += firsts[row];
         turns.count = firsts[row + 1] - firsts[row];
     }
-    if (turns.count == 0 || !has_room(&turns, memory, decision->release_ns))
-        lose(decision, NOACK_OVERFLOWED);
-    int leaves = decision->fate == NOACK_DELIVERED && turns.count > 0;
-    if (leaves)
-        decision->release_ns = take_turn(&turns, memory, decision->release_ns);
-    if (decision->copy_ns == NOACK_NEVER_NS)
-        return;
-    decision->copy_ns = leaves && has_room(&turns, memory, decision->copy_ns)
-                            ? take_turn(&turns, memory, decision->copy_ns)
-                            : NOACK_NEVER_NS;
+    if (turns.count == 0 || !has_room(&turns, memory, copy->time_ns))
+        lose(packet, NOACK_OVERFLOWED);
+    if (copy->exists && turns.count > 0)
+        copy->time_ns = take_turn(&turns, memory, copy->time_ns);
 }

@@ -10,5 +10,5 @@ void apply_scripted(packet *packet, const noack_stage *stage, noack_stage_memory
         number %= settings->period;
     int64_t place = first_above(numbers, settings->begin, settings->end, number - 1);
     if (place < settings->end && numbers[place] == number)
-        lose(packet->decision, NOACK_DROPPED);
+        lose(packet, NOACK_DROPPED);
 }

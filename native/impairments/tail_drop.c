@@ -52,32 +52,22 @@ int64_t noack_queue_serve(noack_link *link, int64_t stage, int64_t size_bytes) {
     return queue->busy_until_ns;
 }
 
-/* Put the packet and then its copy into the queue; ignore a packet that is lost already. */
+/* Put the packet into the queue; ignore a packet that is lost already. */
 void apply_tail_drop(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;
-    noack_decision *decision = packet->decision;
+    packet_copy *copy = copy_in(packet);
     noack_link *link = packet->link;
     int64_t number = packet->stage;
-    int has_law = stage->kind == NOACK_CODEL;
-    if (decision->fate != NOACK_DELIVERED)
+    if (!copy->exists)
         return;
-    if (!noack_queue_enters(link, number, decision->release_ns))
-        lose(decision, NOACK_OVERFLOWED);
-    if (decision->fate == NOACK_DELIVERED) {
-        if (has_law && codel_is_due(link, number))
-            lose(decision, NOACK_OVERFLOWED);
-        if (decision->fate == NOACK_DELIVERED)
-            decision->release_ns = noack_queue_serve(link, number, decision->size_bytes);
-        else
-            codel_drop(link, number);
-    }
-    if (decision->copy_ns == NOACK_NEVER_NS)
+    if (!noack_queue_enters(link, number, copy->time_ns))
+        lose(packet, NOACK_OVERFLOWED);
+    if (!copy->exists)
         return;
-    int enters =
-        decision->fate == NOACK_DELIVERED && noack_queue_enters(link, number, decision->copy_ns);
-    int drops = enters && has_law && codel_is_due(link, number);
-    decision->copy_ns =
-        enters && !drops ? noack_queue_serve(link, number, decision->size_bytes) : NOACK_NEVER_NS;
-    if (drops)
+    if (stage->kind == NOACK_CODEL && codel_is_due(link, number))
+        lose(packet, NOACK_OVERFLOWED);
+    if (copy->exists)
+        copy->time_ns = noack_queue_serve(link, number, packet->decision->size_bytes);
+    else
         codel_drop(link, number);
 }

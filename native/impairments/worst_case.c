@@ -3,5 +3,5 @@
 
 void apply_worst_case(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)stage, (void)memory;
-    lose(packet->decision, NOACK_DROPPED);
+    lose(packet, NOACK_DROPPED);
 }

@@ -2,8 +2,10 @@
 
    How a packet is lost: the relay of a live run (native/relay/loop.c) or the channel of a simulated
    one (channel.c) has received a datagram of a flow, and asks for a decision. decide_for applies
-   the stages of native/impairments/ in order, each to every packet, lost or not. A stage, or the
-   limit of packets in flight, loses it by lose (core.h), unless it must pass (noack_must_pass).
+   the stages of native/impairments/ in order, each to every packet, lost or not, and to its
+   duplicate, if an earlier stage made one. A stage, or the limit of packets in flight, loses such a
+   copy by lose (core.h), unless the packet must pass (noack_must_pass) and has no other. The packet
+   is lost if no copy is left.
    noack_settle completes the decision. A packet that only arrives corrupted is lost, too. One that
    leaves before earlier ones makes these stale: they are lost as well, and it is held back if that
    would break the guarantee. The consecutive losses up to it are what noack_must_pass compares with
@@ -39,44 +41,72 @@ static stage_function *const APPLY[NOACK_STAGE_KINDS] = {
 
 /* Decide as the user's network did; a packet that must pass leaves nevertheless. */
 static void apply_outcome(int64_t outcome_ns, noack_decision *decision) {
-    if (outcome_ns < 0)
-        lose(decision, NOACK_DROPPED);
-    if (decision->fate == NOACK_DELIVERED)
-        decision->release_ns = decision->arrival_ns + max_of(outcome_ns, 0);
-    else
+    int loses = outcome_ns < 0;
+    decision->loss_suppressed = loses && decision->must_pass;
+    if (loses && !decision->must_pass) {
+        decision->fate = NOACK_DROPPED;
         decision->release_ns = NOACK_NEVER_NS;
-}
-
-/* Swap a packet and its copy if the copy leaves first. */
-static void order_copies(noack_decision *decision) {
-    if (decision->copy_ns == NOACK_NEVER_NS || decision->copy_ns >= decision->release_ns)
-        return;
-    int64_t time_ns = decision->release_ns, bit = decision->bit;
-    decision->release_ns = decision->copy_ns;
-    decision->copy_ns = time_ns;
-    decision->bit = decision->copy_bit;
-    decision->copy_bit = bit;
-}
-
-/* Drop a delayed packet or its copy if it needs more than the free places in flight. A packet that
-   is lost, by this or before, has neither times nor flipped bits. */
-static void keep_limit(int64_t free_places, noack_decision *decision) {
-    int64_t now_ns = decision->arrival_ns;
-    if (decision->release_ns > now_ns && free_places <= 0)
-        lose(decision, NOACK_OVERFLOWED);
-    if (decision->fate != NOACK_DELIVERED) {
-        decision->release_ns = decision->copy_ns = NOACK_NEVER_NS;
-        decision->bit = decision->copy_bit = -1;
-        return;
-    }
-    order_copies(decision);
-    if (decision->copy_ns > now_ns && free_places < (decision->release_ns > now_ns ? 2 : 1)) {
-        decision->copy_ns = NOACK_NEVER_NS;
-        decision->copy_bit = -1;
+    } else {
+        decision->release_ns = decision->arrival_ns + max_of(outcome_ns, 0);
     }
 }
 
-/* A packet that must pass is exempt from everything that would lose it. */
+/* The copy that leaves first. */
+static int first_copy(const packet *packet) {
+    const packet_copy *copies = packet->copies;
+    int duplicate_leaves = copies[DUPLICATE].exists;
+    return duplicate_leaves && copies[ORIGINAL].exists
+               ? copies[DUPLICATE].time_ns < copies[ORIGINAL].time_ns
+               : duplicate_leaves;
+}
+
+/* Lose the copies that are delayed and find no free place in flight. */
+static void keep_limit(int64_t free_places, packet *packet) {
+    int first = first_copy(packet);
+    for (int i = 0; i < COPIES; i++) {
+        packet->copy = i == 0 ? first : COPIES - 1 - first;
+        int is_delayed = copy_in(packet)->time_ns > packet->decision->arrival_ns;
+        if (is_delayed && free_places <= 0)
+            lose(packet, NOACK_OVERFLOWED);
+        else if (is_delayed && copy_in(packet)->exists)
+            free_places--;
+    }
+}
+
+/* Note when the copies leave, in this order. */
+static void decide_departures(const packet *packet) {
+    noack_decision *decision = packet->decision;
+    int first = first_copy(packet);
+    const packet_copy *earlier = &packet->copies[first],
+                      *later = &packet->copies[COPIES - 1 - first];
+    decision->release_ns = earlier->exists ? earlier->time_ns : NOACK_NEVER_NS;
+    decision->bit = earlier->exists ? earlier->bit : -1;
+    decision->copy_ns = later->exists ? later->time_ns : NOACK_NEVER_NS;
+    decision->copy_bit = later->exists ? later->bit : -1;
+}
+
+/* Apply the stages, one after the other, to the packet, and to its duplicate behind the stage that
+   made it. */
+static void apply_stages(packet *packet, noack_stage_memory *memory) {
+    const noack_link *link = packet->link;
+    for (packet->stage = 0; packet->stage < link->stage_count; packet->stage++, memory++) {
+        const noack_stage *stage = &link->stages[packet->stage];
+        int has_duplicate = packet->copies[DUPLICATE].exists;
+        packet->copy = ORIGINAL;
+        APPLY[stage->kind](packet, stage, memory);
+        if (has_duplicate) {
+            noack_stage_memory latest = *memory;
+            packet->copy = DUPLICATE;
+            APPLY[stage->kind](packet, stage, memory);
+            latest.taken_until_ns = memory->taken_until_ns; /* it has taken a slot */
+            *memory = latest;
+        }
+    }
+    if (packet->decision->waits)
+        complete_waiting_decision(packet);
+}
+
+/* The last intact copy of a packet that must pass is exempt from everything that would lose it. */
 void decide_for(
     noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns, const int64_t *outcome_ns,
     noack_decision *decision) {
@@ -106,15 +136,15 @@ void decide_for(
     if (outcome_ns != NULL) {
         apply_outcome(*outcome_ns, decision);
     } else {
-        packet arriving = {link, flow, decision, 0};
-        noack_stage_memory *memory = link->memory + row * link->stage_count;
-        for (; arriving.stage < link->stage_count; arriving.stage++) {
-            const noack_stage *stage = &link->stages[arriving.stage];
-            APPLY[stage->kind](&arriving, stage, &memory[arriving.stage]);
-        }
-        if (decision->waits)
-            complete_waiting_decision(decision);
-        keep_limit(link->limit - link->in_flight, decision);
+        packet arriving = {
+            .link = link,
+            .flow = flow,
+            .decision = decision,
+            .copies = {[ORIGINAL] = {.exists = 1, .time_ns = now_ns, .bit = -1}},
+        };
+        apply_stages(&arriving, link->memory + row * link->stage_count);
+        keep_limit(link->limit - link->in_flight, &arriving);
+        decide_departures(&arriving);
     }
     noack_settle(link, row, decision);
 }

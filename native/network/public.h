@@ -18,15 +18,15 @@ enum noack_fate {
     NOACK_BLACKED_OUT
 };
 
-/* The decision for a packet; the stages modify it one after the other. */
+/* The decision for a packet. */
 typedef struct {
     int64_t fate;
     int64_t packet;             /* its number in its flow */
     int64_t consecutive_losses; /* consecutive losses up to this packet */
     int64_t release_ns;         /* departure time; NOACK_NEVER_NS: never */
-    int64_t copy_ns;            /* departure time of its copy; NOACK_NEVER_NS: never */
+    int64_t copy_ns;            /* departure time of a second copy; NOACK_NEVER_NS: never */
     int64_t bit;                /* the bit that is flipped; -1: none */
-    int64_t copy_bit;           /* the bit that is flipped in the copy; -1: none */
+    int64_t copy_bit;           /* the bit that is flipped in the second copy; -1: none */
     int64_t hold_back_ns;       /* time for which it is held back for the guarantee */
     int64_t makes_stale;        /* number of packets that it makes stale */
     int64_t arrival_ns;
@@ -201,7 +201,6 @@ typedef struct {
     /* no packet leaves before: departure time of the first one, if it had to be delivered; with a
        scheduler, of the last one; of the last one in flight at a change */
     int64_t first_release_ns;
-    double score;               /* normal score of the link's state for the last packet */
     int64_t newest;             /* greatest number among the packets that have left intact */
     int64_t since;              /* number of the first packet under the present settings */
     int64_t error_level;        /* of the packet that arrives; 0: unknown. The caller sets it */

@@ -69,26 +69,30 @@ void enter_queue(packet *packet, int64_t key, int is_time) {
     noack_decision *decision = packet->decision;
     noack_link *link = packet->link;
     noack_stage_state *queue = &link->stage_states[packet->stage];
-    if (decision->fate != NOACK_DELIVERED)
+    if (!copy_in(packet)->exists)
         return;
     noack_queue_enters(link, packet->stage, decision->arrival_ns);
     if (queue->count + queue->waiting_count >= link->stages[packet->stage].queue_places)
-        lose(decision, NOACK_OVERFLOWED);
-    if (decision->fate != NOACK_DELIVERED)
+        lose(packet, NOACK_OVERFLOWED);
+    if (!copy_in(packet)->exists)
         return;
     int64_t begin_ns = max_of(queue->entry_ns, queue->busy_until_ns);
     decision->waits = 1;
     decision->key = key + (is_time ? queue->entry_ns : 0);
     decision->after_ns = -(begin_ns + 1); /* negative until all stages have seen the packet */
-    decision->release_ns += begin_ns + 1 - decision->arrival_ns;
+    copy_in(packet)->time_ns += begin_ns + 1 - decision->arrival_ns;
 }
 
-void complete_waiting_decision(noack_decision *decision) {
-    int64_t least_ns = -decision->after_ns;
-    decision->release_ns = max_of(decision->release_ns, least_ns);
-    decision->after_ns = decision->release_ns - least_ns;
-    if (decision->copy_ns != NOACK_NEVER_NS)
-        decision->copy_ns = max_of(decision->copy_ns, least_ns);
+void complete_waiting_decision(packet *packet) {
+    noack_decision *decision = packet->decision;
+    int64_t least_ns = -decision->after_ns, first_ns = INT64_MAX;
+    for (packet->copy = 0; packet->copy < COPIES; packet->copy++) {
+        packet_copy *copy = copy_in(packet);
+        copy->time_ns = max_of(copy->time_ns, least_ns);
+        if (copy->exists)
+            first_ns = min_of(first_ns, copy->time_ns);
+    }
+    decision->after_ns = first_ns == INT64_MAX ? 0 : first_ns - least_ns;
 }
 
 void wait_for_link(

@@ -162,37 +162,55 @@ def _joint_chain(parts: Sequence[Chain | PeriodicLosses]) -> tuple[Array, Array,
     start: Array = np.ones(1)
     transitions: Array = np.ones((1, 1))
     chains = [part.chain if isinstance(part, PeriodicLosses) else part for part in parts]
-    joined: list[Chain] = []
+    actions: list[_Action] = []
     for chain in chains:
         n, size_so_far = len(chain.start), len(start)
         start = np.kron(start, chain.start).astype(np.float64)
         transitions = np.kron(transitions, chain.transitions).astype(np.float64)
-        joined = [chain_before._replace(acts=np.repeat(chain_before.acts, n)) for chain_before in joined]
-        joined.append(chain._replace(acts=np.tile(chain.acts, size_so_far)))
-    return start, transitions, _ineffective(joined, states)
+        actions = [
+            _Action(before.kind, *(np.repeat(shares, n) for shares in before[1:])) for before in actions
+        ]
+        shares = (np.tile(acts, size_so_far) for acts in (chain.acts, chain.acts_on_duplicate))
+        actions.append(_Action(chain.action, *shares))
+    return start, transitions, _ineffective(actions, states)
 
 
-def _ineffective(chains: Sequence[Chain], states: int) -> Array:
-    """Return the probability (states,) that no intact copy of a packet leaves."""
-    passes = np.ones(states)
-    shares = np.zeros((2, 3, states))
-    """Axis 0: packet intact, corrupt. Axis 1: no copy, intact copy, corrupt copy. Axis 2: state."""
-    shares[0, 0] = 1.0
-    for chain in chains:
-        if chain.action == "lose":
-            passes = passes * (1 - chain.acts)
-        elif chain.action == "duplicate":
-            copied = shares.sum(axis=1) * chain.acts
-            shares *= 1 - chain.acts
-            shares[0, 1] += copied[0]
-            shares[1, 2] += copied[1]
-        else:
-            corrupted = shares[0] * chain.acts
-            shares += np.stack([-corrupted, corrupted])
-            copies = shares[:, 1] * chain.probability
-            shares[:, 1] -= copies
-            shares[:, 2] += copies
-    ineffective: Array = 1 - passes * (1 - shares[1, 0] - shares[1, 2])
+class _Action(NamedTuple):
+    """What an impairment does to a packet, with a probability in each of n states of all impairments."""
+
+    kind: str  # ``lose``, ``corrupt`` or ``duplicate``
+    on_packet: Array  # (n,)
+    on_duplicate: Array  # (n,)
+
+
+_LOST, _INTACT, _CORRUPT = range(3)
+
+
+def _ineffective(actions: Sequence[_Action], states: int) -> Array:
+    """Return the probability (states,) that no intact copy of a packet leaves.
+
+    There are at most two copies, the packet and its duplicate. A duplicate that was not made counts
+    as lost.
+    """
+    shares = np.zeros((3, 3, states))
+    """Axis 0: the packet is lost, intact or corrupt. Axis 1: its duplicate is. Axis 2: the state."""
+    shares[_INTACT, _LOST] = 1.0
+    for action in actions:
+        if action.kind == "duplicate":
+            for condition in (_INTACT, _CORRUPT):
+                for single in ((condition, _LOST), (_LOST, condition)):
+                    made = shares[single] * action.on_packet
+                    shares[single] -= made
+                    shares[condition, condition] += made
+            continue
+        changed_to = _LOST if action.kind == "lose" else _CORRUPT
+        for of_copy, acts in ((shares, action.on_packet), (shares.swapaxes(0, 1), action.on_duplicate)):
+            for condition in (_INTACT, _CORRUPT):
+                if condition != changed_to:
+                    changed = of_copy[condition] * acts
+                    of_copy[condition] -= changed
+                    of_copy[changed_to] += changed
+    ineffective: Array = 1 - shares[_INTACT].sum(axis=0) - shares[[_LOST, _CORRUPT], _INTACT].sum(axis=0)
     return ineffective
 
 

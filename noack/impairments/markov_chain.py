@@ -44,7 +44,12 @@ class Chain(NamedTuple):
     transitions: Array  # (n, n) Transition matrix
     acts: Array  # (n,) Probability in each state that it acts on the packet
     action: str = "lose"  # The action: ``lose``, ``corrupt`` or ``duplicate``
-    probability: float = 0.0  # Probability that it acts on a copy
+    by_number: bool = False  # Whether it acts on a packet's duplicate as it does on the packet
+
+    @property
+    def acts_on_duplicate(self) -> Array:
+        """(n,) Probability in each state that it acts on a packet's duplicate, as on the next packet."""
+        return self.acts if self.by_number else np.asarray(self.transitions @ self.acts)
 
 
 class PeriodicLosses(NamedTuple):
@@ -69,11 +74,12 @@ class PeriodicLosses(NamedTuple):
         """Return the pattern as a Markov chain."""
         period = len(self.lost)
         if not self.begin:
-            return Chain(np.eye(period)[-1], np.roll(np.eye(period), 1, axis=1), self.lost.astype(float))
+            start, transitions = np.eye(period)[-1], np.roll(np.eye(period), 1, axis=1)
+            return Chain(start, transitions, self.lost.astype(float), by_number=True)
         transitions = np.eye(self.states, k=1)
         transitions[-1, -period] = 1.0
         acts = np.concatenate([np.zeros(self.begin + 1), np.roll(self.lost, -(self.begin % period))])
-        return Chain(np.eye(self.states)[0], transitions, acts)
+        return Chain(np.eye(self.states)[0], transitions, acts, by_number=True)
 
 
 def pattern(period: int, lost: Iterable[int], begin: int = 0) -> PeriodicLosses:
@@ -97,13 +103,13 @@ def chance_chain(probability: float, correlation: float, action: str) -> Chain:
     """
     if correlation == 0.0 or probability in (0.0, 1.0):
         certain = np.ones(1), np.ones((1, 1)), np.array([probability])
-        return Chain(*certain, action, probability)
+        return Chain(*certain, action)
     nodes, weights, acts = _nodes(probability, correlation)
     innovation = math.sqrt(1 - correlation**2)
     steps = (nodes - correlation * nodes[:, None]) / innovation
     transitions = stochastic(np.exp(-(steps**2) / 2) * weights)
     start = np.exp(-(nodes**2) / 2) * weights
-    return Chain(start / start.sum(), transitions, acts, action, probability)
+    return Chain(start / start.sum(), transitions, acts, action)
 
 
 def _nodes(probability: float, correlation: float) -> tuple[Array, Array, Array]:

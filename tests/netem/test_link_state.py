@@ -61,7 +61,14 @@ def fates(link: Link, flow: int, count: int) -> list[Fate]:
     return [fate_of(link, flow) for _ in range(count)]
 
 
-@pytest.mark.parametrize("loss", ["loss 60%", "loss gemodel 30% 20%", "loss gemodel 40% 30% 90% 10%"])
+@pytest.mark.parametrize(
+    "loss",
+    [
+        "loss 60%", "loss gemodel 30% 20%", "loss gemodel 40% 30% 90% 10%",
+        "duplicate 50% loss 70%", "duplicate 60% loss gemodel 40% 30% 90% 10%",
+        "loss 20% duplicate 100% loss 70% duplicate 50% loss 60%",
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("guarantee", ["", "mansd 2 first", "mansd 4 atmost 3 in 7", "mansd 3 recover 2"])
 def test_the_fates_are_those_of_the_definition(loss: str, guarantee: str) -> None:
     settings = settings_of(f"{loss} {guarantee}")
@@ -104,7 +111,7 @@ def test_a_flows_fates_depend_on_nothing_but_its_own_order(
 
 @pytest.mark.parametrize("words", LOSSES[:-1])
 def test_every_seed_name_and_flow_has_a_stream_of_its_own(words: str) -> None:
-    """Which no other impairment changes."""
+    """Which no other impairment changes, but for one that makes copies, each with its own fate."""
     sequences = [
         tuple(fates(Link(settings_of(words), seed, *name), flow, 100))
         for seed, name, flow in itertools.product((5, 6), (("a",), ("b",), ("a", "b")), (0, 1))
@@ -114,12 +121,53 @@ def test_every_seed_name_and_flow_has_a_stream_of_its_own(words: str) -> None:
         assert tuple(fates(new_link(more_words), 0, 100)) == sequences[0]
 
 
+def test_each_copy_of_a_duplicate_has_a_fate_of_its_own() -> None:
+    """In the order of the words: behind a loss there is only one draw for both."""
+    before, behind = (
+        fates(new_link(words), 0, 4000).count(Fate.DROPPED) / 4000
+        for words in ("duplicate 100% loss 50%", "loss 50% duplicate 100%")
+    )
+    assert abs(before - 0.25) < 0.03
+    assert abs(behind - 0.5) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("words", "forwarded"),
+    [
+        # What passes the impairment later than the blackout's begin is lost.
+        ("duplicate 100% delay 10ms samples 0ms,20ms blackout 20ms-1s", None),
+        ("duplicate 100% rate 8kbit 0 queue 1", 1),
+        ("duplicate 100% loss worst", 0),
+        ("duplicate 100% loss worst mansd 0", 1),
+        ("duplicate 100% corrupt 100% mansd 0", 2),
+        ("duplicate 100% corrupt 100% loss worst mansd 0", 1),
+    ],
+)
+def test_impairments_act_on_each_copy_by_itself(words: str, forwarded: int | None) -> None:
+    counts = set()
+    for seed in range(40):
+        link = Link(settings_of(words), seed, "a", flows=2)
+        link.handle(Datagram(0, b"x" * 10), 0)
+        drain(link)
+        counts.add(link.counters.forwarded)
+        if link.state.settings.mansd is not None:
+            assert link.counters.forced == 1
+            assert link.counters.longest_loss_burst == 0
+    assert counts == ({0, 1, 2} if forwarded is None else {forwarded})
+
+
+def test_the_slot_of_a_copy_is_taken() -> None:
+    link = Link(settings_of("duplicate 100% schedule 0 slot 1ms"), 0, "a", flows=1)
+    for _ in range(3):
+        link.handle(Datagram(0, b"x"), 1)
+    assert [t_ns // MS for t_ns, _ in drain(link)] == [1, 2, 3, 4, 5, 6]
+
+
 @pytest.mark.parametrize(
     ("words", "overflowed"),
     [
         ("delay 10ms", 15),
         ("duplicate 100% delay 10ms", 17),
-        ("duplicate 100% delay 10ms reorder 100% mansd 3", 0),  # only copies are delayed
     ],
 )
 def test_the_limit_bounds_the_datagrams_and_copies_in_flight(words: str, overflowed: int) -> None:

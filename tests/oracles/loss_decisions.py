@@ -1,13 +1,15 @@
-"""The fates of a flow's packets on a link that loses and does not delay, by definition.
+"""The fates of a flow's packets on a link that loses and duplicates, and does not delay, by definition.
 
 Independent of the core: Philox4x32-10 (Salmon et al. 2011), the losses, and the guarantee, which
 holds as long as :mod:`tests.oracles.loss_language` allows the outcomes. Only the key of the random
 stream comes from noack: numpy's SeedSequence.
 """
 
-from collections.abc import Callable
+from collections import Counter
+from typing import Protocol
 
 from noack.core.random_streams import stream_key
+from noack.impairments.kinds.duplicate import Duplicate
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
@@ -31,23 +33,39 @@ def philox(counter: tuple[int, ...], key: tuple[int, ...]) -> tuple[int, ...]:
     return counter
 
 
-def uniform_pair(key: tuple[int, int], flow: int, packet: int) -> tuple[float, float]:
-    """The first two numbers in [0, 1) of a packet, of 53 bits each."""
-    words = philox((packet & _MASK, packet >> 32, flow, 0), key)
+def uniform_pair(key: tuple[int, int], flow: int, packet: int, copy: int) -> tuple[float, float]:
+    """The first two numbers in [0, 1) of a packet, or of its second copy, of 53 bits each."""
+    words = philox((packet & _MASK, packet >> 32, flow, 2 * copy), key)
     first, second = ((words[i] >> 5) << 26 | words[i + 1] >> 6 for i in (0, 2))
     return first / 2**53, second / 2**53
 
 
 def fates_of_flow(settings: LinkSettings, seed: int, name: str, flow: int, count: int) -> list[Fate]:
-    """Return the fates of the first packets of a flow; the link's one impairment is a loss."""
-    (impairment,) = settings.impairments
-    assert isinstance(impairment, LossOf)
-    key = stream_key(seed, "netem", name, "loss")
-    is_lost = _losses(impairment.loss)
+    """Return the fates of the first packets of a flow on a link of losses and duplicates.
+
+    Each of at most two copies of a packet passes the impairments behind its duplication by itself.
+    """
+    numbers: Counter[str] = Counter()
+    stages = []
+    for impairment in settings.impairments:
+        numbers[impairment.kind] += 1
+        number = numbers[impairment.kind]
+        stream = impairment.kind if number == 1 else f"{impairment.kind} {number}"
+        stages.append((stream_key(seed, "netem", name, stream), _random_event(impairment)))
     outcomes: list[bool] = []
     fates = []
     for packet in range(count):
-        lost = is_lost(*uniform_pair(key, flow, packet))
+        copies = [True, False]
+        for (key, event), impairment in zip(stages, settings.impairments, strict=True):
+            before = list(copies)
+            happens = event(*uniform_pair(key, flow, packet, 0), advances=True)
+            if isinstance(impairment, Duplicate):
+                copies = [happens or copies[0], happens or copies[1]] if any(copies) else copies
+                continue
+            copies[0] &= not happens
+            if before[1]:
+                copies[1] = not event(*uniform_pair(key, flow, packet, 1), advances=False)
+        lost = not any(copies)
         may_be_lost = is_allowed([*outcomes, True], settings) and (packet or not settings.first_delivered)
         outcomes.append(lost and bool(may_be_lost))
         fate_of_loss = Fate.DROPPED if may_be_lost else Fate.FORCED
@@ -55,19 +73,29 @@ def fates_of_flow(settings: LinkSettings, seed: int, name: str, flow: int, count
     return fates
 
 
-def _losses(loss: object) -> Callable[[float, float], bool]:
-    """Return a function of the two numbers of each packet in turn: whether the link loses it."""
-    if isinstance(loss, BernoulliLoss):
-        return lambda first, _: first < loss.probability
-    assert isinstance(loss, GilbertElliottLoss)
-    assert loss.good_to_bad is not None
-    assert loss.bad_to_good is not None
-    changes, lost_in = (loss.good_to_bad, loss.bad_to_good), (loss.loss_in_good, loss.loss_in_bad)
+class _Event(Protocol):
+    """Whether something happens to a packet, given its two numbers; ``advances``: to the original."""
+
+    def __call__(self, first: float, second: float, *, advances: bool) -> bool: ...
+
+
+def _random_event(impairment: object) -> _Event:
+    """Return a function for the copies of each packet in turn: whether it is lost, or duplicated."""
+    event = impairment.loss if isinstance(impairment, LossOf) else impairment
+    if isinstance(event, BernoulliLoss | Duplicate):
+        probability = event.probability
+        return lambda first, second, advances: first < probability
+    assert isinstance(event, GilbertElliottLoss)
+    assert event.good_to_bad is not None
+    assert event.bad_to_good is not None
+    changes, lost_in = (event.good_to_bad, event.bad_to_good), (event.loss_in_good, event.loss_in_bad)
     state = 0
 
-    def is_lost(first: float, second: float) -> bool:
+    def is_lost(first: float, second: float, *, advances: bool) -> bool:
         nonlocal state
-        state ^= first < changes[state]
-        return second < lost_in[state]
+        following = state ^ (first < changes[state])
+        if advances:
+            state = following
+        return second < lost_in[following]
 
     return is_lost

@@ -1,4 +1,4 @@
-"""Duplicates: a packet is sent twice."""
+"""Duplicates: a packet is sent twice. Each copy passes the later impairments by itself."""
 
 from typing import ClassVar, Literal
 
@@ -9,7 +9,7 @@ from noack.settings.section import Probability
 
 
 class Duplicate(CorrelatedChance, Impairment):
-    """Sends a packet twice."""
+    """Sends a packet twice; each copy passes the later impairments by itself."""
 
     kind: Literal["duplicate"] = "duplicate"
     probability: Probability
@@ -20,5 +20,5 @@ class Duplicate(CorrelatedChance, Impairment):
     action: ClassVar = "duplicate"
 
     def meaning(self) -> str:
-        correlation = self.correlation_meaning
-        return f"sends {brief_percent(self.probability)} of the packets twice{correlation}"
+        packets = brief_percent(self.probability)
+        return f"sends {packets} of the packets twice, each with its own fate{self.correlation_meaning}"

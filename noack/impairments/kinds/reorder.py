@@ -12,13 +12,18 @@ from noack.settings.section import Probability
 
 
 class Reorder(CorrelatedChance, Impairment):
-    """Lets a packet leave at once, before packets that arrived earlier and are delayed."""
+    """Lets a packet leave at once, before packets that arrived earlier and are delayed.
+
+    As in tc: after a packet that left at once, ``gap`` − 1 are delayed, and then each is a candidate
+    until a draw succeeds. With probability P the share of packets that leave at once is
+    1/(``gap`` − 1 + 1/P), whatever the correlation between the draws.
+    """
 
     kind: Literal["reorder"] = "reorder"
     probability: Probability = 1.0
-    """Probability of reordering, for every ``gap``-th packet."""
+    """Probability of reordering, for each candidate."""
     gap: Annotated[int, Field(ge=1, le=2**40)] = 1
-    """Only every ``gap``-th packet can be reordered."""
+    """After a packet that left at once, ``gap`` − 1 packets are no candidates."""
 
     clauses: ClassVar = (
         Clause(
@@ -36,13 +41,16 @@ class Reorder(CorrelatedChance, Impairment):
         return before._replace(reordered=before.reordered or reorders)
 
     def meaning(self) -> str:
-        packets = f"{brief_percent(self.probability)} of the packets"
-        if self.gap != 1:
-            packets = f"every {self.gap}th packet"
-            if self.probability < 1:
-                packets += f", with probability {brief_percent(self.probability)},"
-        correlation = self.correlation_meaning
-        return f"sends {packets} at once, before those that are delayed{correlation}"
+        chance, correlation = brief_percent(self.probability), self.correlation_meaning
+        packets = f"{chance} of the packets" if self.gap == 1 else f"every {self.gap}th packet"
+        if self.gap == 1 or self.probability == 1:
+            return f"sends {packets} at once, before those that are delayed{correlation}"
+        share = 1 / (self.gap - 1 + 1 / self.probability) if self.probability else 0.0
+        return (
+            f"sends {brief_percent(share)} of the packets at once, before those that are delayed: "
+            f"after one of them {self.gap - 1} are delayed, then each leaves at once with "
+            f"probability {chance}{correlation}, until one does"
+        )
 
     def stage(self, tables: StageTables) -> Stage:
         stage = super().stage(tables)

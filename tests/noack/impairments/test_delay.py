@@ -157,11 +157,28 @@ def test_reordered_packets_leave_at_once(decide: Any, share_is: Callable[..., No
     decided = decide(f"delay 10ms reorder 30% gap {gap}", 100_000)
     at_once = decided.delays_ns == 0
     assert set(decided.delays_ns.tolist()) == {0, 10_000_000}
-    turns = np.arange(1, 100_001) % gap == 0
-    assert not at_once[~turns].any()
-    share_is(at_once[turns], 0.3)
+    share_is(at_once, 1 / (gap - 1 + 1 / 0.3))
+    assert np.diff(np.flatnonzero(at_once), prepend=-1).min() == gap
     # Only delays before the reorder are skipped.
     assert (decide("delay 10ms reorder 100% delay 3ms", 10).delays_ns == 3_000_000).all()
+
+
+@pytest.mark.parametrize(("correlation", "gap"), [(0, 5), (50, 5), (90, 3)])
+def test_a_packet_is_a_candidate_until_it_leaves_at_once(
+    decide: Any, share_is: Callable[..., None], correlation: int, gap: int
+) -> None:
+    """As in tc: the share is 1/(N − 1 + 1/P), which a correlation of the draws does not change."""
+    words = f"delay 10ms reorder 20% {correlation}% gap {gap}"
+    at_once = decide(words, 400_000).delays_ns == 0
+    share_is(at_once, 1 / (gap - 1 + 5))
+    distances = np.diff(np.flatnonzero(at_once))
+    assert distances.min() == gap
+    assert (distances % gap != 0).any()
+
+
+def test_lost_packets_are_no_candidates(decide: Any) -> None:
+    delays_ns = decide("delay 10ms loss periodic 1/2 reorder 100% gap 3", 18).delays_ns
+    assert (delays_ns == 0).tolist() == [False, False, True] * 3
 
 
 def read_delay(folder: Path, **settings: Any) -> Delay:

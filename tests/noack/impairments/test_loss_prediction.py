@@ -28,6 +28,14 @@ DECISIONS = 400_000
 EXACT = {
     "": 0.0,
     "loss none mansd 3": 0.0,
+    "duplicate 100% loss 50%": 0.25,
+    "duplicate 20% loss 50%": 0.8 * 0.5 + 0.2 * 0.25,
+    "loss 50% duplicate 100%": 0.5,
+    "duplicate 100% corrupt 50% loss 50%": 0.75**2,
+    # Each copy has its own draw; the state of the second is that of the next packet.
+    "duplicate 100% loss gemodel 25% 25%": 0.5 * 0.75,
+    "duplicate 100% loss gemodel 0% 0% 100% 10%": 0.01,
+    "duplicate 100% loss periodic 2/100": 0.02,  # both copies have the packet's number
     "loss worst": 1.0,
     "loss worst mansd 4": 4 / 5,
     "loss worst mansd 0": 0.0,
@@ -92,6 +100,15 @@ def test_predicted_losses_are_those_of_the_closed_form() -> None:
         "loss gemodel 5% 2% 97% 10% atmost 4 in 12",
         "loss periodic 3/20 loss 20% atmost 2 in 7",
         "corrupt 20% duplicate 50% loss 20% mansd 2 recover 3",
+        "duplicate 50% loss 40%",
+        "duplicate 60% loss 30% loss 20% mansd 2",
+        "duplicate 100% loss gemodel 10% 30%",
+        "duplicate 100% loss gemodel 10% 30% 80% 5% mansd 3",
+        "duplicate 100% loss state 10% 20% 3% 40% 5% mansd 4",
+        "duplicate 70% 50% loss 40% mansd 3",
+        "duplicate 100% corrupt 40% 90% loss 10% mansd 2",
+        "duplicate 50% loss 30% duplicate 50% corrupt 20% loss 30% atmost 2 in 5",
+        "duplicate 100% loss periodic 3/20 loss 20% mansd 3",
     ],
 )
 def test_many_decisions_have_the_predicted_loss(decide: Any, share_is: Any, words: str) -> None:
