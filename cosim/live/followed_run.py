@@ -43,13 +43,16 @@ class FollowedLoop(NamedTuple):
     """Time of the run at which the loop's own time begins."""
 
 
+_WHOLE_RUN = FollowedLoop("", (), (), 0)
+
+
 class LiveRows(NamedTuple):
     """Rows that a process of an active run has sent."""
 
     table: str
     """Name of the table; ``docs/record.md`` has them."""
-    loop: FollowedLoop | None
-    """None: notices about the whole run, in its time."""
+    loop: FollowedLoop
+    """Its name is empty for notices about the whole run, whose times are those of the run."""
     rows: NDArray[np.void]
     """A structured array; times are those of the loop. That of ``notices`` has the fields ``t_ns``,
     ``level``, ``text`` and ``process``."""
@@ -130,9 +133,9 @@ class FollowedRun:
         """Yield each line of a batch for the log."""
         for text in lines_in(batch):
             line = parse_message(LogLine, text)
-            loop = line.loop if line.loop is not None or len(self.loops) > 1 else 0
+            number = 0 if line.loop is None and len(self.loops) == 1 else line.loop
             row = np.array([(line.t_ns, line.level, line.text, process)], _NOTICE)
-            yield LiveRows(NOTICES, None if loop is None else self.loops[loop], row)
+            yield LiveRows(NOTICES, _WHOLE_RUN if number is None else self.loops[number], row)
 
 
 def follow(directory: str | Path, *, timeout_s: float = 30.0) -> FollowedRun:

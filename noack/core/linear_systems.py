@@ -8,6 +8,7 @@ replay on another machine, would then differ in the last bits of every state. So
 """
 
 import math
+import warnings
 from functools import lru_cache
 
 import numpy as np
@@ -23,6 +24,11 @@ Stack = NDArray[np.float64]
 MatrixKey = tuple[tuple[int, ...], bytes]
 """Shape and bits of a matrix, by which equal matrices are known."""
 
+_SINGULAR_STEP = 1e-12
+"""A matrix is singular if its smallest singular value is below this share of its largest one, both in
+units of the states in which rows and columns have similar sizes."""
+_LOGARITHM_TOLERANCE = 1e-9
+"""Largest relative difference between a matrix and the exponential of its logarithm."""
 _CACHED_STEPS = 4096
 """Transition matrices that are kept."""
 _NEGLIGIBLE = 1e-140
@@ -145,6 +151,27 @@ def product(matrix: Matrix, vector: Vector) -> Vector:
     result = np.empty(len(matrix))
     core.noack_product(*matrix.shape, _reals(matrix), _reals(vector), _reals(result))
     return result
+
+
+def real_logarithm(step: Matrix) -> Matrix | None:
+    """Return the real L with e^L = ``step``, (n, n); None: there is none, or it is too inexact.
+
+    A singular matrix has none: a part of the state is gone after the step. Neither has one with a negative
+    eigenvalue that occurs once.
+    """
+    with warnings.catch_warnings(action="ignore"):  # the result is checked
+        from scipy.linalg import expm, logm, matrix_balance  # takes 0.2 s: linear plants do not need it
+
+        balanced, units = matrix_balance(step, permute=False)
+        sizes = np.linalg.svd(balanced, compute_uv=False)
+        if not sizes[-1] > _SINGULAR_STEP * sizes[0]:
+            return None
+        logarithm = np.asarray(np.real(logm(balanced)))
+        if not np.isfinite(logarithm).all():
+            return None
+        is_inexact = np.abs(expm(logarithm) - balanced).max() > _LOGARITHM_TOLERANCE * np.abs(balanced).max()
+    scales = np.diag(units)
+    return None if is_inexact else logarithm * scales[:, None] / scales
 
 
 def spectral_abscissa(matrix: Matrix) -> float:

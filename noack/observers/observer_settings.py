@@ -13,6 +13,7 @@ import numpy as np
 
 from noack.core.core_library import CData, new_handle, new_structure
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.pole_placement import place_poles
 from noack.settings.section import Row, ScenarioSection, Table, require_length
 
 _RANK_TOLERANCE = 1e-9
@@ -137,20 +138,15 @@ def unobservable_mode(A: Matrix, C: Matrix, *, stable_too: bool = False) -> comp
 def observer_gain(A: Matrix, C: Matrix, poles: tuple[complex, ...]) -> Matrix:
     """Return L, shape (n, p), for which (I − L C) A has these eigenvalues.
 
-    L is the state feedback of the dual pair (Aᵀ, (CA)ᵀ), by the method of Tits and Yang, which is
-    robust if there is more than one output. The poles are n eigenvalues, each complex one with its
-    conjugate.
+    L is the state feedback of the dual pair (Aᵀ, (CA)ᵀ). The poles are n eigenvalues, each complex
+    one with its conjugate.
 
     Raises:
         ValueError: the eigenvalues cannot be placed.
     """
-    # Imported here: observers with a given gain do not need this large module.
-    from scipy.signal import place_poles
-
     if unobservable_mode(A, C, stable_too=True) is not None:
         raise ValueError("(Â, C) is not observable")
-    placed = place_poles(A.T, (C @ A).T, np.array(poles), maxiter=100, rtol=1e-3)
-    gain = np.ascontiguousarray(placed.gain_matrix.T)
+    gain = np.ascontiguousarray(-place_poles(A.T, (C @ A).T, np.array(poles)).T)
     reached = np.linalg.eigvals((np.eye(len(A)) - gain @ C) @ A)
     error = np.abs(np.sort_complex(reached) - np.sort_complex(np.array(poles))).max()
     if not error < _POLE_TOLERANCE:

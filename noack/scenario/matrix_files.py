@@ -21,7 +21,7 @@ from pydantic import ValidationError
 
 from noack.core.errors import CallerError, why
 from noack.core.file_access import new_file
-from noack.core.linear_systems import Matrix
+from noack.core.linear_systems import Matrix, real_logarithm
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.scenario.mat_file import arrays_of_mat
 from noack.scenario.sections import ModelSection, instability
@@ -40,8 +40,6 @@ _MOST_ARRAYS = 1000
 _DIRECTORY_ENTRY = b"PK\1\2"
 """Begins each entry of an archive's directory."""
 _NUMBERS = "fiub"
-_SAMPLED = 1e-9
-"""Largest difference of samples, as a share of the largest entry, that is rounding."""
 
 
 def with_matrices(content: ReadTable, folder: Path, source: str) -> ReadTable:
@@ -322,18 +320,14 @@ def _in_continuous_time(A: Matrix, B: Matrix, dt: ArrayLike | None) -> tuple[Mat
         return A, B
     if isinstance(dt, bool | np.bool_) or not float(np.asarray(dt).ravel()[0]) > 0:
         raise ValueError("dt: the sampling time is not stated; give it in seconds")
-    from scipy.linalg import expm, logm  # imported here: it takes time
-
     (n, m), step_s = B.shape, float(np.asarray(dt).ravel()[0])
-    whole = np.block([[A, B], [np.zeros((m, n)), np.eye(m)]])
-    with warnings.catch_warnings(action="ignore"):
-        exponent = np.asarray(logm(whole))
-    rate = exponent.real / step_s
-    if (
-        not np.isfinite(rate).all()
-        or np.abs(expm(exponent.real) - whole).max() > _SAMPLED * np.abs(whole).max()
-    ):
-        raise ValueError("dt: no system in continuous time has these samples; give the continuous one")
+    logarithm = real_logarithm(np.block([[A, B], [np.zeros((m, n)), np.eye(m)]]))
+    if logarithm is None:
+        raise ValueError(
+            "dt: a step of it has no real logarithm: no linear system in continuous time has these samples; "
+            "give the continuous one"
+        )
+    rate = logarithm / step_s
     return rate[:n, :n], rate[:n, n:]
 
 

@@ -18,6 +18,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.number_checks import real_number
 from noack.core.number_format import TextRows, as_text, to_digits
+from noack.core.pole_placement import place_poles
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
 from noack.plants.systems.linearisation import linearise as linear_motion
 from noack.scenario.given_settings import given_settings
@@ -406,21 +407,15 @@ def _with_integrals(model: LinearModel, integrals: Mapping[str, Vector]) -> tupl
 
 
 def _place_poles(model: LinearModel, poles: Complex) -> Matrix:
-    from scipy.signal import place_poles  # importing scipy takes 0.2 s
-
     basis = model.controllable
     if not np.isfinite(poles).all() or (poles.real >= 0).any():
         raise CallerError("poles: they need negative real parts, e.g. -1,-2+1j,-2-1j")
     if len(poles) != model.rank:
         raise CallerError(f"poles: {len(poles)} given; the controllable part has {model.rank} eigenvalues")
     try:
-        placement = place_poles(basis.T @ model.A @ basis, basis.T @ model.B, poles)
-    except ValueError:
-        raise CallerError(
-            "poles: complex ones must be in conjugate pairs, and none may occur more often than there "
-            f"are independent inputs ({np.linalg.matrix_rank(model.B)})"
-        ) from None
-    return np.asarray(-placement.gain_matrix @ basis.T, dtype=np.float64)
+        return place_poles(basis.T @ model.A @ basis, basis.T @ model.B, poles) @ basis.T
+    except ValueError as error:
+        raise CallerError(f"poles: {error}") from None
 
 
 def _weight_matrix(key: str, weights: ArrayLike | None, matrix: Matrix) -> Matrix:

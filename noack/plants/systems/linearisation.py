@@ -11,14 +11,13 @@ is taken at the beginning, and a step later. Central differences give x(t + h) =
 matrix logarithm of [[Ad, Bd], [0, I]] divided by h gives A and B.
 """
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix, Vector, discretise, norm
+from noack.core.linear_systems import Matrix, Vector, discretise, norm, real_logarithm
 from noack.plants.plant_settings import PlantSystem
 
 SystemAt = Callable[[Vector], PlantSystem]
@@ -39,10 +38,6 @@ _ROUNDING = 1e-13
 _DIGITS = 10
 """Significant digits of A and B that are kept."""
 _SAMPLES = {"derivative": 1000, "motion": 100}
-_SMALLEST_EIGENVALUE = 1e-12
-"""If an eigenvalue of a step is below this, a deviation is gone after the step."""
-_LOGARITHM_TOLERANCE = 1e-6
-"""Largest relative difference between the step and the exponential of its logarithm."""
 
 NO_STATE = "x is not its whole state, or it is not smooth"
 NOT_FINITE = "its motion is not finite there"
@@ -199,25 +194,11 @@ def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, step_ns: int) -> Lin
         return without(NO_STATE)
     # Â and B̂ are those of the real logarithm of a step.
     step = step_offs @ np.linalg.inv(start_offs)
-    if np.abs(np.linalg.eigvals(step)).min() < _SMALLEST_EIGENVALUE:
-        return without(NO_LOGARITHM)
-    logarithm = _logarithm(step)
+    logarithm = real_logarithm(step)
     if logarithm is None:
         return without(NO_LOGARITHM)
     generator = logarithm / (step_ns * 1e-9)
     return LinearMotion(generator[:n, :n], generator[:n, n:], drift, "motion")
-
-
-def _logarithm(step: Matrix) -> Matrix | None:
-    """Return the real logarithm of a matrix; None: there is none, or it is too inexact."""
-    with warnings.catch_warnings(action="ignore"):  # the result is checked
-        from scipy.linalg import expm, logm  # takes 0.2 s: linear plants do not need it
-
-        logarithm = np.asarray(np.real(logm(step)))
-        if not np.isfinite(logarithm).all():
-            return None
-        is_inexact = np.abs(expm(logarithm) - step).max() > _LOGARITHM_TOLERANCE * np.abs(step).max()
-    return None if is_inexact else logarithm
 
 
 def largest_errors(

@@ -32,7 +32,6 @@ class Follower(noack.RunObserver):
         except CallerError as error:
             self.refusal = str(error)
         for table, loop, rows in run.rows("plant_step", "notices"):
-            assert loop is not None
             if table == "notices":
                 self.notices += [(row["level"], row["text"], row["process"]) for row in rows]
                 continue

@@ -18,7 +18,7 @@ from noack.core.row_operations import row_norms
 from noack.observers.observer_settings import observer_gain, unobservable_mode
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.estimation import assumed_model, steady_state, true_model
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from tests.cosim.simulation.outage import LosingMachine, simulate_with
@@ -83,6 +83,15 @@ def test_the_covariance_is_that_of_its_equation_also_with_a_large_gain(
     assert (np.abs(F @ P @ F.T + added - P) <= 1e-9 * scale).all()
     if coupling == 1.0:
         np.testing.assert_allclose(P, solve_discrete_lyapunov(F, added), rtol=1e-9)
+
+
+def test_one_output_places_a_repeated_pole(observed: dict[str, Any]) -> None:
+    observed["observer"] = {"kind": "luenberger", "poles_per_s": [-5.0, -5.0]}
+    scenario = resolved(observed)
+    loop, period_s = loop_of(scenario), scenario.timing.measurement_period_ns * 1e-9
+    correction = np.eye(2) - steady_state(scenario).gain @ scenario.plant.measurement.matrix(2)
+    closed = correction @ expm(loop.A_model * period_s)
+    np.testing.assert_allclose(np.poly(closed), np.poly(np.full(2, np.exp(-5.0 * period_s))), atol=1e-9)
 
 
 def test_measurements_that_are_lost_are_bridged_and_replayed(observed: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import signal
 from scipy.io import loadmat, savemat
+from scipy.linalg import expm
 from scipy.sparse import csc_matrix
 
 from noack.core.errors import CallerError
@@ -125,6 +126,21 @@ def control_object(**attributes: Any) -> Any:
     return SimpleNamespace(A=A, B=B, C=C, D=D, **attributes)
 
 
+ROTATION = np.linalg.qr(np.arange(1.0, 10.0).reshape(3, 3) ** 0.5)[0]
+
+
+def test_the_units_of_states_do_not_matter_for_a_sampled_system() -> None:
+    rates, units = (
+        np.array([[-1.0, 3.0, 0.0], [0.0, -2.0, 1.0], [0.5, 0.0, -40.0]]),
+        np.diag([1e5, 1e-4, 1.0]),
+    )
+    steps = expm(0.1 * rates)
+    in_units = units @ steps @ np.linalg.inv(units)
+    system = SimpleNamespace(A=in_units, B=np.ones((3, 1)), C=np.eye(3), D=np.zeros((3, 1)), dt=0.1)
+    found = np.linalg.inv(units) @ np.array(model_of(system, np.zeros((1, 3))).A) @ units
+    assert found == pytest.approx(rates, abs=1e-7)
+
+
 def systems() -> dict[str, Any]:
     return {
         "two": (A, B),
@@ -169,14 +185,23 @@ def test_what_python_control_returns_goes_in_as_it_is() -> None:
 @pytest.mark.parametrize(
     ("matrix", "dt", "message"),
     [
-        ([[-0.5]], 0.1, "no system in continuous time has these samples"),
+        ([[-0.5]], 0.1, "dt: a step of it has no real logarithm: no linear system in continuous time"),
+        ([[0.0]], 0.1, "dt: a step of it has no real logarithm"),  # u acts at the next sample, for one sample
+        (np.diag([0.9, 0.0]), 0.1, "dt: a step of it has no real logarithm"),
+        # x⁺ = 0.905 x + 0.095 z, z⁺ = u: a dead time of one sample.
+        ([[0.905, 0.095], [0.0, 0.0]], 0.1, "dt: a step of it has no real logarithm"),
+        # The same in other coordinates: the eigenvalue is only nearly 0.
+        ([[0.8, -0.35], [-0.24, 0.105]], 0.1, "dt: a step of it has no real logarithm"),
+        # A dead time of three samples in other coordinates: the eigenvalues are of the size 1e-5.
+        (ROTATION @ np.eye(3, k=1) @ ROTATION.T, 0.1, "dt: a step of it has no real logarithm"),
         ([[0.5]], True, "time is not stated"),
     ],
 )
 def test_samples_of_no_system_are_refused(matrix: Any, dt: Any, message: str) -> None:
-    system = SimpleNamespace(A=matrix, B=[[1.0]], C=[[1.0]], D=[[0.0]], dt=dt)
+    n = len(matrix)
+    system = SimpleNamespace(A=matrix, B=np.ones((n, 1)), C=np.ones((1, n)), D=[[0.0]], dt=dt)
     with pytest.raises(CallerError, match=message):
-        model_of(system, [[-1.0]])
+        model_of(system, -np.ones((1, n)))
     with pytest.raises(CallerError, match=message):
         controller_of(system)
 

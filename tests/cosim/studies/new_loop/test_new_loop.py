@@ -313,6 +313,10 @@ def test_the_regulator_solves_the_riccati_equation(name: str) -> None:
     assert regulator.decay_per_s > 0
 
 
+def test_one_input_places_a_repeated_pole() -> None:
+    assert noack.gain("double_integrator", poles=[-2, -2]).K.tolist() == [[-4.0, -4.0]]  # (s + 2)²
+
+
 @pytest.mark.parametrize("poles", [[-1, -2, -3, -4], [-2 + 1j, -2 - 1j, -3 + 2j, -3 - 2j]])
 def test_a_regulator_has_the_poles_that_were_asked_for(poles: list[complex]) -> None:
     placed = noack.gain("cart_pole", poles=poles)
