@@ -94,7 +94,9 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
     held = [claim for claim in claims if claim.output and claim.verdict == "held"]
     guaranteed = {claim.output: claim.what for claim in held if " stays within " in claim.what}
     bounded = {claim.output for claim in held}
-    texts, is_good, is_late = [], not _grew(loop), loop.certified_for is not None
+    has_target = all(output.target is not None for output in loop.outputs)
+    is_good = not _grew(loop) if has_target else loop.diverged_at_s is None
+    texts, is_late = [], loop.certified_for is not None
     for output in loop.outputs:
         if output.allowed is None:
             continue
@@ -120,9 +122,11 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
         ]
     packets = counted(loop.longest_loss_burst, "consecutive packet")
     losses = f", although up to {packets} {'was' if loop.longest_loss_burst == 1 else 'were'} lost"
-    if not is_good:
+    if not is_good or not has_target:
         losses = f", with up to {packets} lost"
     text = f"{together.join(texts)}{losses if loop.longest_loss_burst else ''}"
+    if not has_target:
+        text += "; their set-point is not known, as a class computes the input: controller.setpoint states it"
     return _line(text, Tone.GOOD if is_good else Tone.DOUBTFUL)
 
 

@@ -67,11 +67,12 @@ class ControllerSettings(ScenarioSection):
     """The input before the first update, and without one that may be used, m entries; by default 0."""
     setpoint: Row | None = None
     """x_r, n entries: the state at which the loop is to rest; by default 0. It must be an
-    equilibrium of the model, Âx_r + B̂u_r = 0; then u = K(x_c − x_r) + u_r."""
+    equilibrium of the model, Âx_r + B̂u_r = 0; then u = K(x_c − x_r) + u_r. A class receives both."""
 
     reference: Annotated[tuple[AnyPiece, ...], Field(min_length=1, max_length=MOST_PIECES)] | None = None
     """The reference that the loop follows in place of a set-point: pieces in the order of time,
-    each a table with ``kind``. x_r and u_r follow from them by the model; u = K(x_c − x_r) + u_r."""
+    each a table with ``kind``. x_r and u_r follow from them by the model; u = K(x_c − x_r) + u_r. A class
+    receives both."""
 
     update_timeout_s: Annotated[FiniteFloat, Field(ge=1e-6, le=1e9)] | None = None
     """Age of the newest update from which on it is no longer used; by default there is none."""
@@ -82,6 +83,13 @@ class ControllerSettings(ScenarioSection):
     """Number of inputs in an actuation: that of the tick, and those of the model for the following
     ticks. The plant applies each at its time, until a newer actuation arrives (packetised
     predictive control)."""
+
+    @property
+    def target(self) -> Literal["set-point", "reference"] | None:
+        """What the outputs are to follow; None: a law that is not linear has a set-point of its own."""
+        if self.reference is not None:
+            return "reference"
+        return "set-point" if self.is_linear or self.setpoint is not None else None
 
     @property
     def states(self) -> int:

@@ -33,7 +33,7 @@ class PythonLaw:
     """An object of a user's class.
 
     It has ``on_tick(t_s, x_c)``, which returns u, and may have ``start(model)``, which receives a
-    :class:`ControlModel` once, and ``on_update(t_s, x)``.
+    :class:`ControlModel` once, ``on_update(t_s, x)``, and ``on_reference(t_s, x_r, u_r)``.
 
     Raises:
         CallerError: the class does not exist, raises, or has no ``on_tick``.
@@ -56,8 +56,11 @@ class PythonLaw:
                 self._user.on_update(t_s, read_only(x))
 
     def input(self, t_s: float, x_c: Vector, setpoint: tuple[Vector, Vector] | None) -> Vector:
-        """Return the result of ``on_tick``; a set point is not supported."""
+        """Return the result of ``on_tick``, after ``on_reference`` if the class has it."""
         with self._user_code():
+            if hasattr(self._user, "on_reference"):
+                x_r, u_r = (np.zeros(len(x_c)), np.zeros(self._inputs)) if setpoint is None else setpoint
+                self._user.on_reference(t_s, read_only(x_r), read_only(u_r))
             u = self._user.on_tick(t_s, read_only(x_c))
             checked = real_vector("the result of on_tick", u, self._inputs)
             if not np.isfinite(checked).all():

@@ -134,8 +134,6 @@ def _require_reference_possible(scenario: ScenarioTables, key: str) -> None:
     """Raise ValueError if another setting has no reference other than 0."""
     if scenario.protocol.acknowledges:
         raise ValueError(f'{key}: not with network.protocol = "ack"')
-    if not scenario.controller.is_linear:
-        raise ValueError(f'{key}: not with controller.kind = "{scenario.controller.kind}"')
     if scenario.message_sizes.carries_model:
         raise ValueError(
             f'{key}: the plant\'s watchdog does not have it; use plant.watchdog.policy = "hold" or "zero"'

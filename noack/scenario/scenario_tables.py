@@ -83,10 +83,15 @@ class ScenarioTables(ScenarioSection):
     realtime: RealtimeSection = RealtimeSection.model_construct()
 
     def loop_outputs(self) -> tuple[LoopOutput, ...]:
-        """Return the outputs; raise ValueError, with the key, if a row does not fit."""
+        """Return the outputs; raise ValueError, with the key, if a row does not fit.
+
+        They have no allowed errors if only the controller's law knows what they are to follow.
+        """
         model = self.named_model
         further = model.dimensions[0] - model.plant_states
-        return loop_outputs(self.outputs, model.state_names or (), model.state_units, further)
+        outputs = loop_outputs(self.outputs, model.state_names or (), model.state_units, further)
+        has_target = self.controller.target is not None
+        return outputs if has_target else tuple(output._replace(allowed=None) for output in outputs)
 
     @property
     def named_model(self) -> ModelSection:

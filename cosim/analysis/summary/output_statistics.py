@@ -33,7 +33,7 @@ def _output_part(record: RunRecord, output: LoopOutput) -> OutputPart:
         name=output.name,
         unit=output.unit,
         allowed=output.allowed,
-        target="set-point" if record.scenario.controller.reference is None else "reference",
+        target=record.scenario.controller.target,
         largest=largest,
         last=last,
         settled_s=settled_s,

@@ -338,12 +338,14 @@ class OutputPart(SummaryPart):
     unit: str
     allowed: Real
     """The allowed error; None: nothing is asked."""
-    target: str
-    """What it is to follow: set-point or reference."""
+    target: Literal["set-point", "reference"] | None
+    """What it is to follow; None: the controller's law has a set-point of its own, which noack does not
+    know. Distances are then those from 0."""
     largest: Real
     last: Real
     settled_s: Real
-    """From when on the output stayed within the allowed error; None: it was not within at the end."""
+    """From when on the output stayed within the allowed error; None: it was not within at the end,
+    or its target is not known."""
 
 
 class LoopSummary(SummaryPart):

@@ -355,7 +355,7 @@ def _output_curves(record: RunRecord, output: LoopOutput) -> list[Curve]:
 
 def _outputs(record: RunRecord, bounds: Mapping[str, list[Curve]]) -> PageFigure:
     outputs = _stated_outputs(record)[:_MOST_OUTPUTS]
-    target = "set-point" if record.scenario.controller.reference is None else "reference"
+    target = record.scenario.controller.target or "0, as its set-point is not known"
     drawn = {output: _output_curves(record, output) for output in outputs}
 
     def draw(figure: "Figure") -> list[Panels]:

@@ -12,6 +12,9 @@ from scipy.optimize import minimize
 
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.loop_summary import summarise_loop
+from cosim.analysis.summary.output_statistics import output_parts
+from cosim.output.result_tables import Tone
+from cosim.output.run_verdict import verdict
 from cosim.record.run_record import RunRecord, load_record
 from cosim.simulation.virtual_time import simulate, simulate_run
 from noack.controllers.controller_settings import ControlModel
@@ -22,6 +25,7 @@ from noack.scenario.scenario_file import load
 from noack.theory.coverage import require_exact
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.helpers.shipped import resolved
+from tests.helpers.summaries import summary_of
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 EXAMPLES = ("saturated_lqr", "model_predictive")
@@ -89,6 +93,72 @@ def test_mistakes_in_the_settings_give_the_approved_lines() -> None:
     )
     with pytest.raises(CallerError, match=r"^controller\.kind = .*: u is not K x_c; this needs"):
         require_exact(resolve(load(path)))
+
+
+STEERING = """
+    class Steering:
+        def __init__(self, own=0.0):
+            self.x_r, self.u_r = [own, 0.0], 0.0
+
+        def start(self, model):
+            self.K = model.K
+
+        def on_tick(self, t_s, x_c):
+            return self.K @ (x_c - self.x_r) + self.u_r
+
+    class Following(Steering):
+        def on_reference(self, t_s, x_r, u_r):
+            self.x_r, self.u_r = x_r, u_r
+"""
+POSITION = 'outputs=[{name="position", unit="m", allowed=0.05}]'
+
+
+def steered(folder: Path, *settings: str) -> RunRecord:
+    """A run of the double integrator to x_1 = 2, without losses."""
+    (folder / "law.py").write_text(dedent(STEERING))
+    of_class = ["controller.kind=python", f"controller.file={folder / 'law.py'}"]
+    short = ["horizon_s=12", "network.loss={model='lossless'}", POSITION]
+    return simulate(resolved("double_integrator", *of_class, *short, *settings))
+
+
+def test_a_run_to_a_set_point_that_noack_does_not_know_is_not_called_off_target(tmp_path: Path) -> None:
+    record = steered(tmp_path, "controller.name=Steering", "controller.parameters={own=2.0}")
+    (output,) = output_parts(record)
+    assert (output.target, output.allowed, output.settled_s) == (None, None, None)
+    assert output.last == pytest.approx(2.0, abs=0.05)
+    summary = summary_of(record, outputs=[output.model_dump()], diverged_at_s=None)
+    sentence = verdict(summary)[0]
+    assert sentence.tone == Tone.GOOD
+    assert "set-point at the end" not in sentence.text
+    assert "; their set-point is not known, as a class computes the input" in sentence.text
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "controller.setpoint=[2.0, 0.0]",
+        'controller.reference=[{kind="step", output="position", value=2.0, from_s=0.0}]',
+    ],
+)
+def test_a_class_follows_the_set_point_and_the_reference_of_the_scenario(
+    setting: str, tmp_path: Path
+) -> None:
+    record = steered(tmp_path, "controller.name=Following", setting)
+    linear = simulate(
+        resolved("double_integrator", "horizon_s=12", "network.loss={model='lossless'}", POSITION, setting)
+    )
+    (output,), (expected,) = output_parts(record), output_parts(linear)
+    assert output.settled_s is not None
+    assert output == expected
+    assert np.array_equal(record[CONTROLLER_STEP]["u"], linear[CONTROLLER_STEP]["u"])
+    assert replay(record).bit_exact
+
+
+def test_a_set_point_of_0_is_known_if_it_is_stated(tmp_path: Path) -> None:
+    record = steered(tmp_path, "controller.name=Following", "controller.setpoint=[0.0, 0.0]")
+    (output,) = output_parts(record)
+    assert (output.target, output.allowed) == ("set-point", 0.05)
+    assert output.settled_s is not None
 
 
 CODE = """
