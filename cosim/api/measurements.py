@@ -72,6 +72,8 @@ def measure(
     flow: int = 1,
     far_flow: int | None = None,
     sequence_at: str | None = None,
+    bits: int | None = None,
+    numbers: str | None = None,
     clocks: Literal["same", "different"] | None = None,
     period_s: float | None = None,
 ) -> Measurement:
@@ -92,6 +94,8 @@ def measure(
         flow: which flow of a capture; 1 is the largest.
         far_flow: which flow of a capture has the far end of the datagrams.
         sequence_at: where the payloads of a capture have sequence numbers, ``OFFSET:BYTES[:little]``.
+        bits: the number is in so many lowest bits there.
+        numbers: the range of the numbers, ``FIRST..LAST``.
         clocks: whether sending and receiving times were read on the same clock.
         period_s: period of the simulated probe through delivery opportunities.
 
@@ -102,7 +106,7 @@ def measure(
         one_of("clocks", clocks, ("same", "different"))
     differ = None if clocks is None else clocks == "different"
     period_ns = USUAL_PERIOD_NS if period_s is None else probe_period_ns(period_s)
-    reading = SourceOptions(differ, flow, far_flow, sequence_at, period_ns)
+    reading = SourceOptions(differ, flow, far_flow, sequence_at, bits, numbers, period_ns)
     trace = read_source([find_trace(str(source)) for source in sources], reading)
     options = MeasurementOptions(
         deadline_s,

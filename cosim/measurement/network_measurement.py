@@ -191,10 +191,15 @@ class NetworkMeasurement:
             self.require_delays("a deadline (--deadline)")
 
     def require_delays(self, what: str) -> None:
-        """Raise CallerError if the delays of the trace are not known, naming what needs them."""
+        """Raise CallerError if delays, or the number of losses, are not known, naming what needs them."""
         if self.trace.delays_unknown:
             raise CallerError(
                 f"{self.name}: {what} needs delays; they are not known: {self.trace.delays_unknown}"
+            )
+        if self.trace.losses_ambiguous:
+            raise CallerError(
+                f"{self.name}: {what} needs the number of losses, which is not certain: "
+                f"{self.trace.losses_ambiguous}"
             )
 
     @cached_property
@@ -364,6 +369,7 @@ class NetworkMeasurement:
                 for window, losses in self.windows.items()
             },
             "delays_unknown": self.trace.delays_unknown or None,
+            "losses_ambiguous": self.trace.losses_ambiguous or None,
             "delay_s": {str(share): value for share, value in self.delays.quantiles_s.items()},
             "delay_correlation": dict(
                 zip(map(str, self.delays.correlation.lags), self.delays.correlation.at_lags, strict=True)

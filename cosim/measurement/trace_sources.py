@@ -64,6 +64,10 @@ class SourceOptions:
     """Which flow has the far end of the datagrams; None: the nearest one that has them."""
     sequence_at: str | None = None
     """Where the payloads of a capture have sequence numbers: ``OFFSET:BYTES[:little]``."""
+    bits: int | None = None
+    """The number is in so many lowest bits there; None: in all."""
+    numbers: str | None = None
+    """The range of the numbers, ``FIRST..LAST``; None: from 0 on."""
     period_ns: int = USUAL_PERIOD_NS
     """Period of the simulated probe through delivery opportunities."""
 
@@ -72,6 +76,9 @@ class SourceOptions:
         whole_number("flow", self.flow, 1)
         if self.far_flow is not None:
             whole_number("far-flow", self.far_flow, 1)
+        for name, value in (("--bits", self.bits), ("--numbers", self.numbers)):
+            if value is not None and self.sequence_at is None:
+                raise CallerError(f"{name}: says what --sequence-at has; give --sequence-at OFFSET:BYTES")
 
 
 def probe_period_ns(period_s: float) -> int:
@@ -89,10 +96,12 @@ FILE_OPTIONS = {
     "flow": "--flow",
     "far_flow": "--far-flow",
     "sequence_at": "--sequence-at",
+    "bits": "--bits",
+    "numbers": "--numbers",
     "period_ns": "--rate",
 }
 """Options of the command line, by field of :class:`SourceOptions`."""
-_CAPTURE_OPTIONS = ("clocks_differ", "flow", "far_flow", "sequence_at")
+_CAPTURE_OPTIONS = ("clocks_differ", "flow", "far_flow", "sequence_at", "bits", "numbers")
 
 
 def refuse_unused(options: "DataclassInstance", names: Mapping[str, str], source: str, *used: str) -> None:
@@ -156,9 +165,11 @@ def _head(path: Path) -> bytes:
 
 def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace:
     try:
-        field = None if options.sequence_at is None else SequenceField.parse(options.sequence_at)
+        field = None
+        if options.sequence_at is not None:
+            field = SequenceField.parse(options.sequence_at, options.bits, options.numbers)
     except ValueError as error:
-        raise CallerError(f"--sequence-at: {error}") from None
+        raise CallerError(str(error)) from None
     try:
         with ExitStack() as stack:
             files = [decompressed(stack.enter_context(open_regular(path)))[1] for path in paths]

@@ -430,7 +430,7 @@ def _trace_of_numbers(
     )
     index = capture.flows.index(flow)
     _check_dropped(capture, capture.datagrams.where(capture.datagrams.flow == index), trace)
-    return replace(trace, delays_unknown=unknown)
+    return replace(trace, delays_unknown=unknown, losses_ambiguous=numbered.ambiguous)
 
 
 def _planned_times(capture: Capture, packet: Int64s, part: Int64s, received_ns: Int64s) -> tuple[Int64s, str]:

@@ -12,7 +12,7 @@ from noack.traces.captured_datagrams import CapturedDatagram, CapturedFlow
 from noack.traces.captured_flows import Capture
 from noack.traces.merged_datagrams import pieces_of
 from noack.traces.packet_trace import Int64s
-from noack.traces.sequence_numbers import find_packets, nearest_steps
+from noack.traces.sequence_numbers import Arrivals, find_packets, nearest_steps
 
 _FIELD = re.compile(r"([0-9]{1,5}):([1-8])(:little)?")
 _MOST_UNREADABLE = 0.01
@@ -26,6 +26,10 @@ _MOST_OF_OTHER_CONTENT = 0.6
 """Two counters have equal numbers in half of the datagrams; with more, it is no number."""
 _FEWEST_STEPS = 20
 """With fewer steps nothing is said about their size."""
+_MOST_MISSING = 0.9
+"""Share of missing numbers between packets above which others have them: the counter is shared."""
+_RANGE = re.compile(r"([0-9]{1,20})\.\.([0-9]{1,20})")
+_MOST_NUMBERS = 2**62
 
 
 class SequenceField(NamedTuple):
@@ -34,37 +38,73 @@ class SequenceField(NamedTuple):
     offset: int
     size_bytes: int
     is_little: bool
+    low_bits: int | None = None  # The number is in the lowest bits of the field; None: in all
+    first: int = 0  # The numbers count from here
+    last: int | None = None  # To here, and then from the first again; None: as far as the bits go
 
     @classmethod
-    def parse(cls, text: str) -> "SequenceField":
-        """Parse ``OFFSET:BYTES`` or ``OFFSET:BYTES:little``; raise ValueError if it is neither."""
+    def parse(cls, text: str, bits: int | None = None, numbers: str | None = None) -> "SequenceField":
+        """Parse ``OFFSET:BYTES`` or ``OFFSET:BYTES:little``, and a range ``FIRST..LAST``.
+
+        Raises:
+            ValueError: one line; it begins with the option.
+        """
         match = _FIELD.fullmatch(text)
         if match is None:
             raise ValueError(
-                f"expected OFFSET:BYTES with 1 to 8 bytes, e.g. 2:2 for RTP, or 8:4:little; found {text!r}"
+                "--sequence-at: expected OFFSET:BYTES with 1 to 8 bytes, e.g. 2:2 for RTP, or 8:4:little; "
+                f"found {text!r}"
             )
-        return cls(int(match[1]), int(match[2]), match[3] is not None)
+        field = cls(int(match[1]), int(match[2]), match[3] is not None)
+        if bits is not None:
+            if not 2 <= bits <= field.bits:
+                raise ValueError(f"--bits: expected 2 to {field.bits}, the bits of the field; found {bits}")
+            field = field._replace(low_bits=bits)
+        if numbers is not None:
+            ends = _RANGE.fullmatch(numbers)
+            first, last = (int(ends[1]), int(ends[2])) if ends else (0, 0)
+            if not 0 <= first < last - 1 < 2**field.bits - 1 or last - first >= _MOST_NUMBERS:
+                raise ValueError(
+                    f"--numbers: expected FIRST..LAST, at most {2**field.bits - 1}, with three numbers or "
+                    f"more, e.g. 1..255; found {numbers!r}"
+                )
+            field = field._replace(first=first, last=last)
+        return field
 
     @property
     def bits(self) -> int:
-        """The size of the numbers."""
-        return 8 * self.size_bytes
+        """The bits of the numbers."""
+        return self.low_bits or 8 * self.size_bytes
+
+    @property
+    def size(self) -> int:
+        """How many different numbers there are."""
+        return (1 << self.bits) - self.first if self.last is None else self.last - self.first + 1
+
+    @property
+    def kind(self) -> str:
+        """The numbers in words."""
+        return f"of {self.bits} bits" if self.last is None else f"{self.first}..{self.last}"
 
     def read(self, payload: bytes) -> int | None:
-        """Return the number; None if the payload is too short."""
+        """Return the number, counted from the first one; None if the payload is too short.
+
+        A number outside the range is ``size`` or more.
+        """
         part = payload[self.offset : self.offset + self.size_bytes]
         if len(part) < self.size_bytes:
             return None
-        return int.from_bytes(part, "little" if self.is_little else "big")
+        number = int.from_bytes(part, "little" if self.is_little else "big") & ((1 << self.bits) - 1)
+        return number - self.first if number >= self.first else self.size
 
     def numbers_of(self, payload: bytes, size_bytes: int, largest_step: int) -> list[int] | None:
         """Return the numbers of a payload's pieces; None if they do not ascend in steps up to the largest."""
         numbers: list[int] = []
         for piece in pieces_of(payload, size_bytes):
             number = self.read(piece)
-            if number is None:
+            if number is None or number >= self.size:
                 return None
-            if numbers and not 1 <= (number - numbers[-1]) % (1 << self.bits) <= largest_step:
+            if numbers and not 1 <= (number - numbers[-1]) % self.size <= largest_step:
                 return None
             numbers.append(number)
         return numbers
@@ -81,6 +121,7 @@ class NumberedPackets(NamedTuple):
     received_ns: Int64s
     row: Int64s  # Numbers of the datagrams in the order of the file
     period_ns: float
+    ambiguous: str = ""  # Why the number of losses is not certain; empty: it is
 
 
 class _Numbers(NamedTuple):
@@ -100,7 +141,7 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
         raise ValueError(f"fewer than two datagrams have a sequence number at {field}")
     _check_steps(capture, numbers, field)
     try:
-        found = find_packets(numbers.number, numbers.t_ns, field.bits)
+        found = find_packets(numbers.number, numbers.t_ns, field.bits, field.size)
     except ValueError as error:
         raise ValueError(
             f"the numbers at {field} {error}; check --sequence-at, or filter the capture"
@@ -109,11 +150,6 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
     strays = len(numbers.number) - len(found.arrival)
     if strays:
         notes.append(f"datagrams left out because their number does not belong to the sequence: {strays}")
-    if found.uncertain:
-        notes.append(
-            f"gaps in which the numbers of {field.bits} bits wrapped around: {len(found.uncertain)}; how "
-            "often is not certain, and a sender that paused or began again may look the same"
-        )
     packet = found.packet.copy()
     start = 0
     for part in range(int(found.part[-1]) + 1):
@@ -129,7 +165,45 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
     numbered = NumberedPackets(
         packet, found.part, numbers.t_ns[found.arrival], numbers.row[found.arrival], found.period_ns
     )
-    return _first_of_each(capture, numbered)
+    numbered = _first_of_each(capture, numbered)
+    _check_shared(numbered, field)
+    if not found.uncertain:
+        return numbered
+    ambiguous = _ambiguity(numbered, found, field)
+    notes.append(ambiguous)
+    return numbered._replace(ambiguous=ambiguous)
+
+
+def _ambiguity(numbered: NumberedPackets, found: Arrivals, field: SequenceField) -> str:
+    """Return how many packets may be lost, if numbers may have wrapped around in gaps."""
+    lost = start = 0
+    for part in range(int(numbered.part[-1]) + 1):
+        here = numbered.packet[numbered.part == part]
+        lost += int(here.max()) - start + 1 - len(here)
+        start = int(here.max()) + 1
+    fewest = lost - field.size * sum(gap.wraps for gap in found.uncertain)
+    most = lost + field.size * sum(gap.most - gap.wraps for gap in found.uncertain)
+    assumed = "the sender paused there" if lost == fewest else "the sender went on there"
+    return (
+        f"gaps in which the numbers {field.kind} may have wrapped around: {len(found.uncertain)}. The "
+        f"numbers do not say how often: {fewest} packets are lost if the sender paused in all of them, "
+        f"{most} if it went on; {lost} is for the case that {assumed}"
+    )
+
+
+def _check_shared(numbered: NumberedPackets, field: SequenceField) -> None:
+    """Refuse numbers of which most are missing all the time: they count more than this flow."""
+    packet = np.sort(numbered.packet)
+    if len(packet) < _FEWEST_STEPS:
+        return
+    steps = np.diff(packet)
+    usual = steps[steps <= 2 * np.quantile(steps, 0.75)]  # without outages
+    missing = 1 - len(usual) / float(usual.sum())
+    if missing > _MOST_MISSING and int(np.gcd.reduce(steps)) == 1:
+        raise ValueError(
+            f"{100 * missing:.0f} % of the numbers at {field} are missing: they count more than this flow, "
+            "as a counter for all receivers of a sender does; capture at both ends"
+        )
 
 
 def _first_of_each(capture: Capture, numbered: NumberedPackets) -> NumberedPackets:
@@ -157,17 +231,17 @@ def _first_of_each(capture: Capture, numbered: NumberedPackets) -> NumberedPacke
                 "seems to have two counters, or no number there; filter the capture, or check --sequence-at"
             )
     first = np.sort(first)
-    packet, part, received_ns, row, period_ns = numbered
-    return NumberedPackets(packet[first], part[first], received_ns[first], row[first], period_ns)
+    columns = (column[first] for column in numbered[:4])
+    return NumberedPackets(*columns, *numbered[4:])
 
 
 def _check_steps(capture: Capture, numbers: _Numbers, field: SequenceField) -> None:
     """Refuse numbers in the wrong byte order, and note those that rise in equal steps above 1."""
-    steps = nearest_steps(numbers.number, field.bits)
+    steps = nearest_steps(numbers.number, field.size)
     steps = steps[steps != 0]
     if len(steps) < _FEWEST_STEPS:
         return
-    if field.size_bytes > 1 and float((steps % 256 == 0).mean()) > 0.9:
+    if field.bits > 8 and float((steps % 256 == 0).mean()) > 0.9:
         other = str(field._replace(is_little=not field.is_little))
         raise ValueError(
             f"the numbers at {field} rise by multiples of 256, as in the wrong byte order; "
@@ -185,7 +259,7 @@ def _read_numbers(capture: Capture, flow: CapturedFlow, field: SequenceField) ->
     """Return the numbers of a flow in the order of arrival, merged datagrams divided."""
     longest: list[tuple[int, int, bytes]] = []
     numbers, columns = array("Q"), (array("q"), array("q"))
-    cut = short = 0
+    cut = short = outside = 0
     for row, datagram in enumerate(capture.read()):
         if datagram.flow != flow:
             continue
@@ -193,6 +267,9 @@ def _read_numbers(capture: Capture, flow: CapturedFlow, field: SequenceField) ->
         if number is None:
             cut += datagram.is_cut
             short += not datagram.is_cut
+            continue
+        if number >= field.size:
+            outside += 1
             continue
         numbers.append(number)
         columns[0].append(datagram.t_ns)
@@ -210,6 +287,13 @@ def _read_numbers(capture: Capture, flow: CapturedFlow, field: SequenceField) ->
         capture.notes.append(
             f"datagrams left out because they are too short for a number at {field}: {short}"
         )
+    if outside > _MOST_UNREADABLE * (outside + len(numbers)):
+        raise ValueError(
+            f"{outside} of {outside + len(numbers)} numbers at {field} are not in {field.kind}; "
+            "check --numbers"
+        )
+    if outside:
+        capture.notes.append(f"datagrams left out because their number is not in {field.kind}: {outside}")
     read = _Numbers(np.array(numbers, np.uint64), *(np.array(column, np.int64) for column in columns))
     size_bytes = _merged_size([payload for _, _, payload in longest], field)
     if size_bytes:
@@ -261,4 +345,4 @@ def _numbers_of(datagram: CapturedDatagram, field: SequenceField, size_bytes: in
         if numbers is not None:
             return numbers
     number = field.read(datagram.payload)
-    return [] if number is None else [number]
+    return [] if number is None or number >= field.size else [number]

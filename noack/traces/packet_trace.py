@@ -67,6 +67,7 @@ class PacketTrace:
     received_ns: Int64s  # (k,) Since the first sending; −1 for a lost packet
     notes: tuple[str, ...] = ()  # Lines for a report about how the trace was obtained
     delays_unknown: str = ""  # Why the delays are not known, and mean nothing; empty: they are known
+    losses_ambiguous: str = ""  # Why the number of losses is not certain; empty: it is
 
     def __len__(self) -> int:
         return len(self.sequence)

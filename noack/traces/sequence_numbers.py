@@ -1,11 +1,16 @@
 """Which packets arrived, by numbers that wrap around, for a sender with a constant period.
 
-A number of b bits says which packet it is up to multiples of R = 2ᵇ. How many times it wrapped around during
-a gap follows from the time: with a period p, the level t/p − u (arrival time t, packet u) is constant up to
-delays, so its lower envelope rises by R for each wrap that was missed. If it changes by something else, and
-the numbers do not go on, the sender was restarted.
+One of R numbers says which packet it is up to multiples of R (2ᵇ for b bits). How many times they wrapped
+around during a gap follows from the time: with a period p, the level t/p − u (arrival time t, packet u) is
+constant up to delays, so its lower envelope rises by R for each wrap that was missed. If it changes by
+something else, and the numbers do not go on, the sender was restarted.
+
+A gap of Δt holds at most the packets that the sender can send in Δt, Δt/p. A sender that pauses, as an
+event-triggered one does, has longer gaps between its packets; the level then rises at each pause. From its
+numbers nobody can tell a pause that is longer than R periods from the loss of R packets.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +45,10 @@ _MOST_RESTARTS = 1 / 20
 """More restarts per arrival are no restarts: the numbers are none."""
 _FAR_AHEAD_NS, _FAR_BEHIND_NS = 5 * 10**9, 60 * 10**9
 """A single number that is ahead or behind by more than this does not belong to the sequence."""
+_FEWEST_PAUSES = 3
+"""A sender with so many pauses is one that pauses."""
+_MOST_OFF = 1 / 8
+"""Share of R by which delays may vary at a gap that holds R packets."""
 _CERTAIN_RESTART = 2**50
 """A jump by so many packets is a restart."""
 _STEADY = 0.95
@@ -58,43 +67,56 @@ class Arrivals(NamedTuple):
     packet: Int64s  # (k,) Number without wrap-around, from any origin in each part
     part: Int64s  # (k,) 0, and one more after each restart of the sender
     period_ns: float
-    uncertain: tuple[int, ...]  # Of the k, those after a gap in which the number of wraps is not certain
+    uncertain: tuple["UncertainGap", ...] = ()
+    pauses: int = 0  # Gaps in which the sender sent nothing, as far as they are counted
 
 
-def find_packets(number: NDArray[np.uint64], t_ns: Int64s, bits: int) -> Arrivals:
+class UncertainGap(NamedTuple):
+    """A gap in which it is not certain how often the numbers wrapped around."""
+
+    place: int  # Of the k arrivals, the first one after it
+    wraps: int  # The number that is assumed
+    most: int  # The largest number for which there was time
+
+
+def find_packets(number: NDArray[np.uint64], t_ns: Int64s, bits: int, size: int | None = None) -> Arrivals:
     """Return which packets arrived.
 
     Args:
-        number: Numbers, in the order of arrival.
+        number: Numbers from 0 on, in the order of arrival.
         t_ns: Times of arrival, ascending.
         bits: Size of the numbers.
+        size: How many numbers there are; by default all of these bits.
 
     Raises:
         ValueError: what is wrong with the numbers.
     """
-    steps = nearest_steps(number, bits)
+    size = size or 1 << bits
+    steps = nearest_steps(number, size)
     if not (steps > 0).any():
         raise ValueError("do not ascend")
     index = np.arange(len(number))
     is_soon = np.diff(t_ns) < _FAR_BACK * int(t_ns[-1] - t_ns[0]) / len(steps)
     far_back = np.count_nonzero((steps < -_FAR_BACK) & is_soon)
     if far_back > max(_FAR_BACK_SHARE * len(steps), _FEWEST_FAR_BACK):
-        if _continues(number, bits):
+        if _continues(number, size):
             raise ValueError("belong to two counters")
-        is_wide = (steps < -max(2.0**bits / 4, _FAR_BACK)) & is_soon
+        is_wide = (steps < -max(size / 4, _FAR_BACK)) & is_soon
         if np.count_nonzero(is_wide) > max(_WIDE_SHARE * len(steps), _FEWEST_FAR_BACK):
             raise ValueError(f"jump at random, or packets overtake more others than {bits} bits can tell")
         period_ns = _period_of_all(steps, t_ns)
     else:
-        period_ns = _rough_period(steps, t_ns, bits)
+        period_ns = _rough_period(steps, t_ns, size)
     strays = _strays(steps, period_ns)
     if strays.any():
         index, t_ns = index[~strays], t_ns[~strays]
-        steps = nearest_steps(number[~strays], bits)
-    arrivals = _with_wraps(index, steps, t_ns, period_ns, 0.01, bits)
+        steps = nearest_steps(number[~strays], size)
+    arrivals = _with_wraps(index, steps, t_ns, period_ns, 0.01, size)
     refined_ns, error = _refined_period(arrivals, t_ns)
     if refined_ns:
-        arrivals = _with_wraps(index, steps, t_ns, refined_ns, error, bits)
+        arrivals = _with_wraps(index, steps, t_ns, refined_ns, error, size)
+    if arrivals.pauses >= _FEWEST_PAUSES:
+        arrivals = _with_pauses(index, steps, t_ns, period_ns, size)
     if arrivals.part[-1] > 1 + _MOST_RESTARTS * len(number):
         raise ValueError("jump at random")
     return arrivals
@@ -115,28 +137,29 @@ def _strays(steps: Int64s, period_ns: float) -> NDArray[np.bool_]:
     return strays
 
 
-def nearest_steps(number: NDArray[np.uint64], bits: int) -> Int64s:
-    """Return the steps from each number to the next, from −R/2 to R/2."""
+def nearest_steps(number: NDArray[np.uint64], size: int) -> Int64s:
+    """Return the steps from each number to the next of ``size`` numbers, from −R/2 to R/2."""
     steps = np.diff(number).view(np.int64)
-    if bits == 64:
+    if size == 1 << 64:
         return steps
-    half = np.int64(1 << bits - 1)
-    return np.asarray(((steps + half) & np.int64((1 << bits) - 1)) - half)
+    if size == 1 << 63:
+        return np.asarray(((steps + (1 << 62)) & np.int64((1 << 63) - 1)) - (1 << 62))
+    return np.asarray((steps + size // 2) % size - size // 2)
 
 
-def _continues(number: NDArray[np.uint64], bits: int) -> bool:
+def _continues(number: NDArray[np.uint64], size: int) -> bool:
     """Whether most numbers continue one of the four before, as those of two counters do."""
     known = np.zeros(len(number), bool)
-    mask = np.uint64((1 << bits) - 1)
     for distance in range(1, 5):
-        ahead = (number[distance:] - number[:-distance]) & mask
-        known[distance:] |= ahead <= 4
+        for offset in range(distance):  # each distance-th number
+            ahead = nearest_steps(number[offset::distance], size)
+            known[offset::distance][1:] |= (ahead >= 0) & (ahead <= 4)
     return float(known.mean()) > 0.3
 
 
-def _rough_period(steps: Int64s, t_ns: Int64s, bits: int) -> float:
+def _rough_period(steps: Int64s, t_ns: Int64s, size: int) -> float:
     """Return the median of Δt/Δn over small steps."""
-    small = np.abs(steps.astype(float)) <= max(2.0**bits / 8, 1)
+    small = np.abs(steps.astype(float)) <= max(size / 8, 1)
     elapsed_ns = np.diff(t_ns)
     for window in (_WINDOW, 1):
         if len(steps) < window:
@@ -204,10 +227,10 @@ def _noise(level: Reals) -> float:
 
 
 def _with_wraps(
-    index: Int64s, steps: Int64s, t_ns: Int64s, period_ns: float, error: float, bits: int
+    index: Int64s, steps: Int64s, t_ns: Int64s, period_ns: float, error: float, size: int
 ) -> Arrivals:
     """Return the packets for a period that is known up to a relative error."""
-    cycle = 2.0**bits
+    cycle = float(size)
     restarts = np.abs(steps.astype(float)) > _CERTAIN_RESTART
     pauses = np.diff(t_ns) / period_ns
     steps = np.where(restarts, np.rint(pauses).astype(np.int64), steps)
@@ -217,8 +240,8 @@ def _with_wraps(
     spread, noise = _spread(excess, level), _noise(level)
     added = np.zeros(len(packet), np.int64)
     part = np.append(0, restarts.astype(np.int64))
-    uncertain: list[int] = []
-    begin = 0
+    uncertain: list[UncertainGap] = []
+    begin = sender_pauses = 0
     for i in _jumps(excess, steps, level, cycle, spread):
         step, pause = int(steps[i - 1]), float(pauses[i - 1])
         # Packets that have waited during a pause arrive together after it: only behind them does the
@@ -227,15 +250,16 @@ def _with_wraps(
         waiting = min(max(pause, float(level[i]) - before, 0.0), len(level))
         following = level[i : i + _NEIGHBOURS + int(waiting)]
         rise = float(following.min()) - before
-        wraps = round(rise / cycle)
+        most = _most_wraps(pause * (1 + error), step, cycle)
+        wraps = min(round(rise / cycle), most)
         allowed = max(_DELAY_CHANGE_NS / period_ns, _DELAY_CHANGE_SHARE * pause, 6 * spread)
         # Small numbers come round so soon that a restart is told from wraps by little.
         certain = max(_CERTAIN_SHARE * cycle, 4 * noise + error * pause)
         allowed = min(allowed, certain, _MOST_OF_CYCLE * cycle)
         if wraps > 0 and abs(rise - wraps * cycle) <= allowed:
-            added[i] = wraps << bits
+            added[i] = wraps * size
             if pause * error > cycle / 4 or 2 * allowed > _COINCIDENCE * cycle:
-                uncertain.append(i)
+                uncertain.append(UncertainGap(i, wraps, most))
         elif step < 0:
             lasts = (t_ns[i + len(following) - 1] - t_ns[i]) / period_ns
             enough = len(following) >= _FEWEST_AFTER_RESTART and lasts > spread + _FEWEST_AFTER_RESTART / 2
@@ -249,10 +273,38 @@ def _with_wraps(
                 continue
             part[i] = 1
         else:
+            sender_pauses += step > 0 and min(rise, pause - step) > max(allowed, _CLEAR)
             continue
         begin = i
     packet = packet + np.cumsum(added)
-    return Arrivals(index, packet, np.cumsum(part), period_ns, tuple(uncertain))
+    return Arrivals(index, packet, np.cumsum(part), period_ns, tuple(uncertain), sender_pauses)
+
+
+def _most_wraps(pause: float, step: int, cycle: float) -> int:
+    """Return how often the numbers can wrap around in a gap of so many periods, with a step behind it."""
+    return max(math.floor((pause - step) / cycle + _MOST_OFF), 0)
+
+
+def _with_pauses(index: Int64s, steps: Int64s, t_ns: Int64s, period_ns: float, size: int) -> Arrivals:
+    """Return the packets of a sender that pauses, so that a gap is a pause as long as it can be one.
+
+    A restart is a step that does not fit into its gap.
+    """
+    pauses = np.diff(t_ns) / period_ns
+    packet = np.concatenate(([0], np.cumsum(steps)))
+    part = np.zeros(len(packet), np.int64)
+    uncertain = []
+    begin = 0
+    for i in (np.flatnonzero((steps < 0) | (steps > _CLEAR) | (pauses > size / 2)) + 1).tolist():
+        step, pause = int(steps[i - 1]), float(pauses[i - 1])
+        most = _most_wraps(pause, step, float(size))
+        fits = 0 < step <= pause + _CLEAR
+        if fits and most:
+            uncertain.append(UncertainGap(i, 0, most))
+        enough = len(packet) - i >= _FEWEST_AFTER_RESTART
+        if not fits and step and enough and abs(step) > _CLEAR and not _is_reordered(packet, begin, i):
+            part[i], begin = 1, i
+    return Arrivals(index, packet, np.cumsum(part), period_ns, tuple(uncertain), _FEWEST_PAUSES)
 
 
 def _is_reordered(packet: Int64s, begin: int, i: int) -> bool:

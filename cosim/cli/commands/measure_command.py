@@ -77,6 +77,14 @@ def measure(
             help="Where the payloads of a capture of the receiver's end have sequence numbers.",
         ),
     ] = None,
+    bits: Annotated[
+        int | None,
+        Option(metavar="N", help="The sequence number is in the lowest N bits of --sequence-at."),
+    ] = None,
+    numbers: Annotated[
+        str | None,
+        Option(metavar="FIRST..LAST", help="Range of the sequence numbers, e.g. 1..255."),
+    ] = None,
     clocks: Annotated[
         ClockRelation | None,
         Option(help="Whether sending and receiving times were read on the same clock."),
@@ -165,7 +173,7 @@ def measure(
         raise CallerError("--as model: is the form of --write; give its FILE.toml")
     request = OutputRequest(out, requested_files(figure_format, width), write, form.value, scenario)
     differ = None if clocks is None else clocks is ClockRelation.DIFFERENT
-    reading = SourceOptions(differ, flow, far_flow, sequence_at, _period_ns(rate))
+    reading = SourceOptions(differ, flow, far_flow, sequence_at, bits, numbers, _period_ns(rate))
     trace = read_source([*map(find_trace, sources)], reading)
     measurement = NetworkMeasurement(trace, options, " ".join(sources), trace.notes)
     document, written = write_outputs(measurement, request)

@@ -4,6 +4,7 @@ import io
 import json
 import struct
 import tomllib
+from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
 
@@ -245,13 +246,26 @@ def captures_input(choices: Choices) -> None:
         far_flow=choices.choose([None, 1, 2]),
         sequence_at=choices.choose(_SEQUENCE_FIELDS),
     )
+    if options.sequence_at is not None:
+        bits, numbers = choices.choose([None, 2, 14]), choices.choose([None, "1..15", "x"])
+        options = replace(options, bits=bits, numbers=numbers)
     path.write_bytes(_damaged(choices, choices.choose(_CAPTURES)))
     paths = [path]
     if choices.flag():
         other.write_bytes(pcapng_of(*_ARRIVED) if choices.flag() else path.read_bytes())
         paths.append(other)
     with refusal(
-        (str(path), str(other), "expected one file", "--sequence-at", "--flow", "--far-flow", "--clocks")
+        (
+            str(path),
+            str(other),
+            "expected one file",
+            "--sequence-at",
+            "--bits",
+            "--numbers",
+            "--flow",
+            "--far-flow",
+            "--clocks",
+        )
     ):
         trace = read_source(paths, options)
         received = trace.received_ns[~trace.lost]

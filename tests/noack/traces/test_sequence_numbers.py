@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from cosim.measurement.network_measurement import MeasurementOptions, NetworkMeasurement
+from noack.core.errors import CallerError
 from noack.traces.capture_trace import CaptureOptions, read_captures
 from noack.traces.numbered_datagrams import SequenceField
 from noack.traces.packet_trace import PacketTrace
@@ -182,3 +184,112 @@ def test_fields_that_are_no_sequence_numbers_are_refused() -> None:
     by_two = pcap_of(*(Sent(T_NS + k * PERIOD_NS, struct.pack(">I", 2 * k)) for k in range(50)))
     trace = read_captures([io.BytesIO(by_two)], CaptureOptions(sequence_at=SequenceField(0, 4, False)))
     assert any("multiples of 2:" in line for line in trace.notes)
+
+
+def numbered(sent: Sequence[tuple[int, int]], field: SequenceField) -> PacketTrace:
+    """Return the trace of datagrams with (time, number in the whole field)."""
+    payloads = [(t_ns, number.to_bytes(field.size_bytes, "big")) for t_ns, number in sent]
+    file = pcap_of(*(Sent(T_NS + t_ns, payload + b"x") for t_ns, payload in payloads))
+    return read_captures([io.BytesIO(file)], CaptureOptions(sequence_at=field))
+
+
+def keepalive(bits: int, idle_s: int, cycles: int) -> list[tuple[int, int]]:
+    """A source sends 44 packets a second while something changes, else one every ``idle_s``."""
+    sent, t_ns, number = [], 0, 0
+    for _ in range(cycles):
+        for spacing_ns in (*[22_727_000] * 40, *[idle_s * 10**9] * 12):
+            sent.append((t_ns, number % (1 << bits)))
+            t_ns, number = t_ns + spacing_ns, number + 1
+    return sent
+
+
+@pytest.mark.parametrize(("bits", "idle_s"), [(8, 1), (8, 3), (16, 1), (16, 600)])
+def test_a_gap_holds_at_most_what_the_sender_can_send(bits: int, idle_s: int) -> None:
+    sent = keepalive(bits, idle_s, 12)
+    del sent[200], sent[100:102]
+    trace = numbered(sent, SequenceField(0, bits // 8, False))
+    assert int(trace.lost.sum()) == 3
+    assert not trace.losses_ambiguous
+
+
+def test_what_numbers_do_not_say_is_said_with_both_counts() -> None:
+    """44 · 7 s hold 256 packets: a pause of a sender that pauses looks like their loss."""
+    trace = numbered(keepalive(8, 7, 6), SequenceField(0, 1, False))
+    pauses = 6 * 12 - 1
+    assert int(trace.lost.sum()) == 0
+    assert f"wrapped around: {pauses}." in trace.losses_ambiguous
+    assert f": 0 packets are lost if the sender paused in all of them, {256 * pauses} if" in (
+        trace.losses_ambiguous
+    )
+    assert trace.losses_ambiguous in trace.notes
+    with pytest.raises(CallerError, match="a deadline"):
+        NetworkMeasurement(trace, MeasurementOptions(deadline_s=0.1))
+    steady = [(k * PERIOD_NS, k % 256) for k in range(1200) if not 400 <= k < 700]
+    trace = numbered(steady, SequenceField(0, 1, False))
+    assert int(trace.lost.sum()) == 300
+    assert "44 packets are lost if the sender paused in all of them, 300 if" in trace.losses_ambiguous
+    assert not trace.delays_unknown
+    with pytest.raises(CallerError, match="the number of losses, which is not certain"):
+        NetworkMeasurement(trace, MeasurementOptions(deadline_s=0.1))
+
+
+@pytest.mark.parametrize(
+    ("text", "bits", "numbers", "flags"),
+    [
+        ("0:2", 14, None, 0xC000), ("0:2", 12, None, 0x7000), ("0:1", 4, None, 0x50),
+        ("0:1", None, "1..255", 0), ("0:1", 4, "0..14", 0xA0), ("0:4", None, "100..70000", 0),
+    ],
+)  # fmt: skip
+def test_numbers_of_some_bits_or_another_range(
+    text: str, bits: int | None, numbers: str | None, flags: int
+) -> None:
+    field = SequenceField.parse(text, bits, numbers)
+    lost = {40, 300, 301, 302, 303, 900}
+    sent = [
+        (k * PERIOD_NS + k * 7919 % 10**6, flags | (field.first + (k + 11) % field.size))
+        for k in range(1000)
+        if k not in lost
+    ]
+    trace = numbered(sent, field)
+    assert set(np.flatnonzero(trace.lost).tolist()) == lost
+    assert len(trace) == 1000
+    assert not trace.losses_ambiguous
+
+
+@pytest.mark.parametrize(
+    ("bits", "numbers", "message"),
+    [
+        (17, None, "--bits: expected 2 to 16"), (None, "5..4", "--numbers: expected FIRST..LAST"),
+        (None, "0..65536", "--numbers: expected FIRST..LAST, at most 65535"),
+        (None, "x", "--numbers: expected"), (4, "0..16", "--numbers: expected FIRST..LAST, at most 15"),
+    ],
+)  # fmt: skip
+def test_a_wrong_range_is_refused(bits: int | None, numbers: str | None, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SequenceField.parse("0:2", bits, numbers)
+
+
+def test_numbers_outside_the_range_are_refused_or_left_out() -> None:
+    field = SequenceField.parse("0:1", None, "1..255")
+    sent = [(k * PERIOD_NS, 1 + k % 255) for k in range(600)]
+    sent[300] = (sent[300][0], 0)
+    trace = numbered(sent, field)
+    assert np.flatnonzero(trace.lost).tolist() == [300]
+    assert any("not in 1..255: 1" in line for line in trace.notes)
+    with pytest.raises(ValueError, match="are not in 1..255; check --numbers"):
+        numbered([(k * PERIOD_NS, k // 9 % 2) for k in range(600)], field)
+
+
+@pytest.mark.parametrize("size_bytes", [1, 2, 4])
+def test_a_counter_of_several_receivers_is_refused(size_bytes: int) -> None:
+    """Of 51 packets in each period this receiver gets two."""
+    sent = [
+        (k * 33_000_000 + j * 10**5, (51 * k + j) % (1 << 8 * size_bytes)) for k in range(600) for j in (1, 2)
+    ]
+    with pytest.raises(ValueError, match="96 % of the numbers at 0:.* they count more than this flow"):
+        numbered(sent, SequenceField(0, size_bytes, False))
+
+
+def test_an_outage_is_no_shared_counter() -> None:
+    sent = [(k * PERIOD_NS, k) for k in range(20_000) if k < 200 or k > 19_700]
+    assert int(numbered(sent, SequenceField(0, 4, False)).lost.sum()) == 19_501
