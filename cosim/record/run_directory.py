@@ -22,6 +22,7 @@ from typing import Any, Literal, Self
 
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.core.file_access import create_folder, locked, open_growing, read_regular, write_link, write_whole
+from noack.core.json_text import parse_json
 from noack.core.system_processes import cores
 from noack.runtime.spool import SPOOL
 
@@ -162,8 +163,8 @@ def how_to_complete(run_dir: Path) -> str:
 def read_object(path: Path) -> dict[str, Any]:
     """Return the object of a JSON file of a run; empty if the file is missing or damaged."""
     try:
-        content = json.loads(read_regular(path, _MOST_JSON_BYTES))
-    except (OSError, ValueError, RecursionError):
+        content = parse_json(read_regular(path, _MOST_JSON_BYTES))
+    except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -24,6 +24,7 @@ from netem.control.emulator_statistics import Statistics, StatisticsThread
 from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of, words_of
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
+from noack.core.json_text import parse_json
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import with_target_loss
 from noack.runtime import private_folder
@@ -255,7 +256,7 @@ def _require_read(settings: LinkSettings) -> None:
 def _content(query: zenoh.Query) -> dict[str, object]:
     """Return the content of a query; raise CallerError unless it is a JSON object."""
     try:
-        content = json.loads(query.payload.to_string() if query.payload else "{}")
+        content = parse_json(query.payload.to_string() if query.payload else "{}")
     except ValueError:
         content = None
     if not isinstance(content, dict):

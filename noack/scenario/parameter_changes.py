@@ -15,6 +15,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError
+from noack.core.json_text import parse_json
 from noack.protocol.record_tables import CHANGE_BYTES
 from noack.protocol.roles import Notice, Record
 from noack.scenario.runtime_parameters import CONSTRAINTS, LOSS, MANSD, SETPOINT, text_of, trigger_parameters
@@ -49,7 +50,7 @@ def settings_bytes(settings: ReadTable) -> bytes:
 
 def settings_of(data: bytes) -> Table:
     """Read settings from the record; raise ValueError if the data are not settings."""
-    settings = json.loads(data.rstrip(b"\0"))
+    settings = parse_json(data.rstrip(b"\0"))
     if not isinstance(settings, dict):
         raise ValueError("a change is a table of keys and values")
     return settings

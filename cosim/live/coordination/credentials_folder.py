@@ -17,6 +17,7 @@ from typing import IO
 
 from noack.core.errors import CallerError
 from noack.core.file_access import create_folder, lock, locked, move, read_regular
+from noack.core.json_text import parse_json
 
 MARK = ".noack-credentials"
 _MOST_BYTES = 64 * 2**20
@@ -113,7 +114,7 @@ def _written(folder: Path) -> list[Path]:
 
     Raise OSError or ValueError if the mark cannot be read.
     """
-    digests = json.loads(read_regular(folder / MARK, _MOST_BYTES))
+    digests = parse_json(read_regular(folder / MARK, _MOST_BYTES))
     if not isinstance(digests, dict):
         raise ValueError("no object")
     written = []

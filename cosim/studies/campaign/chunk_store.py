@@ -25,6 +25,7 @@ from cosim.studies.campaign.campaign_grid import Point, row_type
 from cosim.studies.campaign.campaign_workers import Chunk, LostWorkersError, OtherArithmeticError, Runner
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.core.file_access import PARTIAL, create_folder, locked, remove_file, write_whole
+from noack.core.json_text import parse_json
 from noack.core.progress import Progress, no_progress
 
 RUNS = "runs"
@@ -181,7 +182,7 @@ def _claim(folder: Path, manifest: Mapping[str, object]) -> Mapping[str, str]:
     """Write or check the folder's manifest; return the code and libraries of its runs."""
     path = folder / CAMPAIGN_FILE
     try:
-        stored_manifest = json.loads(path.read_text(encoding="utf-8"))
+        stored_manifest = parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         write_whole(path, json.dumps(manifest, indent=1))
         stored_manifest = dict(manifest)

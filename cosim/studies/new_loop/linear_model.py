@@ -15,6 +15,7 @@ from cosim.record.run_directory import write_output
 from cosim.studies.new_loop.plant_reference import PlantReference, plant_reference
 from cosim.studies.regulator import lqr_gain
 from noack.core.errors import CallerError
+from noack.core.json_text import parse_json
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.number_checks import real_number
 from noack.core.number_format import TextRows, as_text, to_digits
@@ -492,7 +493,7 @@ def parse_vector(key: str, entries: object, size: int, meaning: str) -> Vector:
 def read_document(path: Path) -> dict[str, UserCode]:
     """Return the document of a file that ``noack linearise`` or ``noack gain`` wrote."""
     try:
-        document = json.loads(path.read_bytes())
+        document = parse_json(path.read_bytes())
     except OSError as error:
         raise CallerError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError:

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from cosim.analysis.summary.loop_summary import summarise_loop
+from cosim.analysis.summary.summary_model import read_summary
 from cosim.api.runs import open_run
 from cosim.output.export.export_formats import export_run
 from cosim.output.export.mat_export import save_mat
@@ -25,12 +26,14 @@ from cosim.record.run_directory import (
     RECORD,
     REPORTS_FILE,
     SCENARIO_FILE,
+    SUMMARY_FILE,
     chosen_run,
     file_of_loop,
     latest_run,
     loop_of_file,
     new_run_dir,
     point_to_latest,
+    read_object,
     require_output,
     write_output,
 )
@@ -263,3 +266,15 @@ def test_tables_figures_and_exports_replace_no_results(
     with pytest.raises(CallerError, match="give another name"):
         export_run(folder, folder, "csv")
     assert not tables.exists()
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999", str(10**30), "9" * 5000])
+def test_a_number_that_json_does_not_have_makes_a_file_of_a_run_damaged(run_dir: Path, number: str) -> None:
+    """A summary is computed again then; a report counts as missing."""
+    summary, reports = run_dir / SUMMARY_FILE, run_dir / REPORTS_FILE
+    assert read_summary(read_object(summary)) is not None
+    content = json.loads(summary.read_text()) | {"horizon_s": "NUMBER"}
+    summary.write_text(json.dumps(content).replace('"NUMBER"', number))
+    assert read_summary(read_object(summary)) is None
+    reports.write_text(f'{{"plant": {{"rows": {{"plant_step": {number}}}}}}}')
+    assert not load_record(run_dir).reports
