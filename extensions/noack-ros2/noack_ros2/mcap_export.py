@@ -2,16 +2,18 @@
 
 Foxglove, PlotJuggler and the libraries of MCAP read it. The log time of a message is the actual
 time of its row, its publish time the nominal one, both in simulated nanoseconds since the run's
-epoch.
+epoch. Log times ascend in the file.
 
 Beside it, a file of its own has ROS 2 messages (profile ``ros2``, CDR, with ``ros2msg`` schemas):
 rosbags and ``ros2 bag`` read files in which every channel is of ROS 2. Log time, publish time and
 topics are the same; the stamp in a message is its nominal time.
 """
 
+import heapq
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -28,6 +30,7 @@ _CHUNK_BYTES = 2**20
 _SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP's sequence numbers have 32 bits
 _LEVELS = {"info": 2, "warning": 3, "error": 4}
 """Numbers of the levels of foxglove.Log."""
+_ROSOUT = "/rosout"
 ERRORS, LOG = "/loop/errors", "/log"
 _SCHEMA_DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _HEX_PATTERN = "^([0-9a-f]{2})*$"
@@ -35,8 +38,18 @@ _REAL_TYPE: dict[str, object] = {"type": ["number", "null"]}  # null: not finite
 _TABLES = {table.name: table for table in TABLES}
 _SCHEMAS = json.loads(Path(__file__).with_name("mcap_schemas.json").read_bytes())
 """Schemas of the messages that are no rows of a table."""
-Message = tuple[int, int, int, bytes]
-"""Log time, publish time, sequence, and content."""
+
+
+class Message(NamedTuple):
+    """A message, with the arguments of the writer but its channel."""
+
+    log_ns: int
+    publish_ns: int
+    topic: str
+    content: bytes
+    sequence: int
+
+
 _ROS_SUFFIX = ".ros2.mcap"
 _ROS_LEVELS = {"warning": 30, "error": 40}
 _ROS_INFO = 20
@@ -78,51 +91,61 @@ def _write_content(writer: Writer, run: ExportedRun) -> None:
     for name, media in (("scenario.toml", "application/toml"), ("summary.json", "application/json")):
         if (run.directory / name).is_file():
             writer.add_attachment(0, 0, name, media, (run.directory / name).read_bytes())
-    _write_log(writer, run)
-    _write_tables(writer, run, [*run.tables])
+    channels: dict[str, int] = {}
+    streams = [_log(run, channels, writer), _rows(run, [*run.tables], channels, writer)]
     for loop in run.loops:
         own = [table for table in loop.tables if OWNER[table] != "netem"]
-        _write_tables(writer, loop, own)
-    for loop in run.loops or [run]:
-        _write_errors(writer, loop)
+        streams.append(_rows(loop, own, channels, writer))
+    streams += [_errors(loop, channels, writer) for loop in run.loops or [run]]
+    for message in _in_order(streams):
+        _add(writer, channels[message.topic], message)
 
 
-def _channel(writer: Writer, run: ExportedRun, topic: str, schema: dict[str, object]) -> int:
-    prefix = f"/{run.name}" if run.name else ""
+def _in_order(streams: Iterable[Iterator[Message]]) -> Iterator[Message]:
+    """Yield the messages of several streams, each in the order of the log time, in this order."""
+    return heapq.merge(*streams, key=lambda message: message.log_ns)
+
+
+def _add(writer: Writer, channel: int, message: Message) -> None:
+    _, publish_ns, _, content, sequence = message
+    writer.add_message(channel, message.log_ns, content, publish_ns, sequence)
+
+
+def _register(
+    writer: Writer, channels: dict[str, int], run: ExportedRun, topic: str, schema: dict[str, object]
+) -> str:
+    """Register a channel; return its topic."""
     schema_id = writer.register_schema(str(schema["title"]), "jsonschema", to_json(schema))
     names = {}
     if not run.is_network:
         states, inputs = run.names
         names = {"states": ", ".join(states), "inputs": ", ".join(inputs)}
-    return writer.register_channel(f"{prefix}{topic}", "json", schema_id, names)
+    topic = f"/{run.name}{topic}" if run.name else topic
+    channels[topic] = writer.register_channel(topic, "json", schema_id, names)
+    return topic
 
 
-def _write_tables(writer: Writer, run: ExportedRun, tables: list[str]) -> None:
-    """Write the rows of some tables in the order of their log time."""
-    channels = {
-        table: _channel(writer, run, _table_topic(table), _table_schema(table, run.tables[table]))
+def _rows(run: ExportedRun, tables: list[str], channels: dict[str, int], writer: Writer) -> Iterator[Message]:
+    """Yield the rows of some tables in the order of their log time."""
+    topics = {
+        table: _register(writer, channels, run, _table_topic(table), _table_schema(table, run.tables[table]))
         for table in tables
     }
     for part in run.parts(*tables):
-        merged = [
-            (*message[:2], channels[table], *message[2:])
-            for table in tables
-            for message in _messages(part[table], run.phase_ns)
-        ]
-        merged.sort(key=lambda message: message[0])
-        for log_ns, publish_ns, channel, sequence, content in merged:
-            writer.add_message(channel, log_ns, content, publish_ns, sequence)
+        yield from _in_order(
+            [_rows_of_table(part[table], topic, run.phase_ns) for table, topic in topics.items()]
+        )
 
 
-def _messages(rows: Rows, phase_ns: int) -> Iterator[Message]:
-    """Yield the rows of a table; their times are those of the run."""
+def _rows_of_table(rows: Rows, topic: str, phase_ns: int) -> Iterator[Message]:
+    """Yield the rows of a table in the order of their log time; their times are those of the run."""
     names = rows.dtype.names or ()
     columns = {name: _column_reader(name, rows[name]) for name in names}
-    for i in range(len(rows)):
+    for i in np.argsort(rows["now_ns"], kind="stable").tolist():
         content = {name: column(i) for name, column in columns.items()}
-        times = (max(int(rows[name][i]) + phase_ns, 0) for name in ("now_ns", "t_ns"))
+        log_ns, publish_ns = (max(int(rows[name][i]) + phase_ns, 0) for name in ("now_ns", "t_ns"))
         sequence = int(rows["sequence"][i]) & _SEQUENCE_MASK
-        yield (*times, sequence, to_json(content, inf_nan_mode="null"))  # type: ignore[misc]
+        yield Message(log_ns, publish_ns, topic, to_json(content, inf_nan_mode="null"), sequence)
 
 
 def _column_reader(name: str, column: Rows) -> Callable[[int], object]:
@@ -135,13 +158,12 @@ def _column_reader(name: str, column: Rows) -> Callable[[int], object]:
     return lambda i: column[i].tobytes().hex()
 
 
-def _write_log(writer: Writer, run: ExportedRun) -> None:
-    """Write the lines of the run's log as foxglove.Log."""
+def _log(run: ExportedRun, channels: dict[str, int], writer: Writer) -> Iterator[Message]:
+    """Yield the lines of the run's log as foxglove.Log."""
     if not run.notices:
         return
-    channel = _channel(writer, run, LOG, _SCHEMAS["log"])
-    for number, notice in enumerate(run.notices):
-        t_ns = max(int(notice["t_ns"]), 0)
+    topic = _register(writer, channels, run, LOG, _SCHEMAS["log"])
+    for number, (t_ns, notice) in enumerate(_notices(run)):
         content = {
             "timestamp": {"sec": t_ns // NS_PER_S, "nsec": t_ns % NS_PER_S},
             "level": _LEVELS.get(notice["level"], 0),
@@ -150,20 +172,23 @@ def _write_log(writer: Writer, run: ExportedRun) -> None:
             "file": "",
             "line": 0,
         }
-        writer.add_message(channel, t_ns, to_json(content), t_ns, number)
+        yield Message(t_ns, t_ns, topic, to_json(content), number)
 
 
-def _write_errors(writer: Writer, run: ExportedRun) -> None:
-    """Write the norms of the errors at each measurement."""
-    channel, keys = (
-        _channel(writer, run, ERRORS, _SCHEMAS["errors"]),
-        ("t_ns", "e_s_norm", "threshold", "e_c_norm"),
-    )
-    columns = run.samples().select(keys).to_pydict()
+def _notices(run: ExportedRun) -> list[tuple[int, Mapping[str, Any]]]:
+    """Return the lines of the run's log by ascending times."""
+    notices = [(max(int(notice["t_ns"]), 0), notice) for notice in run.notices]
+    return sorted(notices, key=lambda line: line[0])
+
+
+def _errors(run: ExportedRun, channels: dict[str, int], writer: Writer) -> Iterator[Message]:
+    """Yield the norms of the errors at each measurement."""
+    topic = _register(writer, channels, run, ERRORS, _SCHEMAS["errors"])
+    columns = run.samples().select(("t_ns", "e_s_norm", "threshold", "e_c_norm")).sort_by("t_ns").to_pydict()
     for number, values in enumerate(zip(*columns.values(), strict=True)):
-        content = to_json(dict(zip(keys, values, strict=True)), inf_nan_mode="null")
+        content = to_json(dict(zip(columns, values, strict=True)), inf_nan_mode="null")
         at_ns = max(values[0] + run.phase_ns, 0)  # damaged records have others
-        writer.add_message(channel, at_ns, content, at_ns, number & _SEQUENCE_MASK)
+        yield Message(at_ns, at_ns, topic, content, number & _SEQUENCE_MASK)
 
 
 # Topics and schemas
@@ -214,11 +239,11 @@ def _write_ros(run: ExportedRun, path: Path) -> None:
     with new_file(path) as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="noack")
-        bag = _Bag(writer)
         loops = run.loops or [run]
-        for loop in loops:
-            bag.write_loop(loop, is_only=len(loops) == 1)
-        bag.write_log(run)
+        streams = [_joint_states(loop, is_only=len(loops) == 1) for loop in loops]
+        bag = _Bag(writer)
+        for message in _in_order([*streams, _rosout(run)]):
+            bag.add(message)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
@@ -228,38 +253,40 @@ class _Bag:
     def __init__(self, writer: Writer) -> None:
         self._writer, self._channels, self._schemas = writer, dict[str, int](), dict[str, int]()
 
-    def _channel(self, topic: str, kind: str) -> int:
+    def add(self, message: Message) -> None:
+        """Write a message."""
+        topic = message.topic
         if topic not in self._channels:
+            kind = ros2.LOG if topic == _ROSOUT else ros2.JOINT_STATE
             if kind not in self._schemas:
                 content = ros2.definition(kind).encode()
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", content)
             profile = {"offered_qos_profiles": ""}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], profile)
-        return self._channels[topic]
+        _add(self._writer, self._channels[topic], message)
 
-    def write_loop(self, run: ExportedRun, *, is_only: bool) -> None:
-        """Write the messages of a loop, each part of its record in the order of the log time."""
-        name = run.scenario.name
-        prefix = ros2.namespace(run.name or name, is_only=is_only)
-        for part in run.parts(*ros2.TOPICS):
-            messages: list[tuple[int, int, str, bytes, int]] = []
-            for table in ros2.TOPICS:
-                rows = part[table]
-                for row, topic, entries in ros2.row_entries(table, rows, *run.names):
-                    log_ns = max(int(rows["now_ns"][row]) + run.phase_ns, 0)
-                    message_entries = entries._replace(stamp_ns=entries.stamp_ns + run.phase_ns)
-                    number = int(rows["sequence"][row]) & _SEQUENCE_MASK
-                    content = ros2.joint_state(message_entries, name)
-                    messages.append((log_ns, message_entries.stamp_ns, f"{prefix}/{topic}", content, number))
-            messages.sort(key=lambda message: message[0])
-            for log_ns, publish_ns, topic, content, number in messages:
-                channel = self._channel(topic, ros2.JOINT_STATE)
-                self._writer.add_message(channel, log_ns, content, max(publish_ns, 0), number)
 
-    def write_log(self, run: ExportedRun) -> None:
-        """Write the lines of the run's log to ``/rosout``."""
-        for number, notice in enumerate(run.notices):
-            t_ns, level = max(int(notice["t_ns"]), 0), _ROS_LEVELS.get(notice["level"], _ROS_INFO)
-            line = ros2.log_line(t_ns, level, notice["process"], notice["text"])
-            channel = self._channel("/rosout", ros2.LOG)
-            self._writer.add_message(channel, t_ns, line, t_ns, number)
+def _joint_states(run: ExportedRun, *, is_only: bool) -> Iterator[Message]:
+    """Yield the messages of a loop, in the order of the log time."""
+    name = run.scenario.name
+    prefix = ros2.namespace(run.name or name, is_only=is_only)
+    for part in run.parts(*ros2.TOPICS):
+        messages: list[Message] = []
+        for table in ros2.TOPICS:
+            rows = part[table]
+            for row, topic, entries in ros2.row_entries(table, rows, *run.names):
+                log_ns = max(int(rows["now_ns"][row]) + run.phase_ns, 0)
+                message_entries = entries._replace(stamp_ns=entries.stamp_ns + run.phase_ns)
+                number = int(rows["sequence"][row]) & _SEQUENCE_MASK
+                content = ros2.joint_state(message_entries, name)
+                publish_ns = max(message_entries.stamp_ns, 0)
+                messages.append(Message(log_ns, publish_ns, f"{prefix}/{topic}", content, number))
+        yield from sorted(messages, key=lambda message: message.log_ns)
+
+
+def _rosout(run: ExportedRun) -> Iterator[Message]:
+    """Yield the lines of the run's log."""
+    for number, (t_ns, notice) in enumerate(_notices(run)):
+        level = _ROS_LEVELS.get(notice["level"], _ROS_INFO)
+        line = ros2.log_line(t_ns, level, notice["process"], notice["text"])
+        yield Message(t_ns, t_ns, _ROSOUT, line, number)

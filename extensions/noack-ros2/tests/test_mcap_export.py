@@ -11,6 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 
 import noack
 from cosim.output.export.export_formats import export_run
@@ -35,6 +37,7 @@ def vector(table: pa.Table, name: str) -> np.ndarray:
 def messages(path: Path) -> dict[str, list[tuple[int, int, dict[str, Any]]]]:
     """Log time, publish time and content of the messages by topic, each valid by its schema."""
     by_topic: dict[str, list[tuple[int, int, dict[str, Any]]]] = {}
+    assert_log_times_ascend(path)
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
             assert schema is not None
@@ -44,6 +47,15 @@ def messages(path: Path) -> dict[str, list[tuple[int, int, dict[str, Any]]]]:
                 jsonschema.validate(content, json.loads(schema.data))
             by_topic[channel.topic].append((message.log_time, message.publish_time, content))
     return by_topic
+
+
+def assert_log_times_ascend(path: Path) -> None:
+    """In the order of the file: players read it from the front."""
+    with path.open("rb") as file:
+        records = StreamReader(file, record_size_limit=None).records
+        times = [record.log_time for record in records if isinstance(record, Message)]
+    assert times == sorted(times)
+    assert times
 
 
 def test_an_mcap_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
@@ -90,7 +102,9 @@ def test_rerun_finds_no_fault_in_an_mcap_file(run: noack.Run, tmp_path: Path) ->
 
 def test_channels_of_several_loops_have_the_loops_names(tmp_path: Path) -> None:
     loops = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.2, "loops.0.count": 2}))
-    by_topic = messages(loops.export(tmp_path / "a.mcap")[0])
+    path, of_ros = loops.export(tmp_path / "a.mcap")
+    assert_log_times_ascend(of_ros)
+    by_topic = messages(path)
     name, loop = list(loops.loops.items())[-1]
     steps = loop.table("plant_step")["now_ns"].to_pylist()
     phase_ns = ResolvedRun(loops.scenario).phases_ns[-1]
