@@ -1,4 +1,6 @@
-"""Random small loops under a schedule, for which there may be a witness."""
+"""Random small loops under a schedule, of several kinds, for which there may be a witness."""
+
+from collections.abc import Callable
 
 import numpy as np
 from flint import arb, fmpq
@@ -8,9 +10,9 @@ from noack_check.balls import beside, identity, matrix, number, zeros
 from noack_check.loop import Loop, Rule, Times
 
 
-def random_periodic_loop(rng: np.random.Generator) -> Loop:
+def _periodic(rng: np.random.Generator) -> Loop:
     """Return a loop whose events come periodically, or nearly so; some under ideal conditions."""
-    loop, zero = random_loop(rng), fmpq(0)
+    loop, zero = _with_a_threshold(rng), fmpq(0)
     times, rule, n = loop.times, loop.rule, loop.n
     least = times.sampling * int(rng.integers(1, 40))
     most = least + times.sampling * fmpq(int(rng.integers(0, 4)), 4) * int(rng.integers(0, 2))
@@ -22,9 +24,9 @@ def random_periodic_loop(rng: np.random.Generator) -> Loop:
     )
 
 
-def random_noisy_loop(rng: np.random.Generator) -> Loop:
+def _noisy(rng: np.random.Generator) -> Loop:
     """Return a loop with noise, often below half the threshold, of some of the kinds above."""
-    kinds = [random_loop, random_loop, random_periodic_loop, random_loop_with_long_delays]
+    kinds = [_with_a_threshold, _with_a_threshold, _periodic, _with_long_delays]
     loop = kinds[rng.integers(len(kinds))](rng)
     n, k = loop.n, int(rng.integers(1, loop.n + 1))
     columns = matrix(np.round(rng.normal(size=(n, k)), 2).tolist())
@@ -34,8 +36,7 @@ def random_noisy_loop(rng: np.random.Generator) -> Loop:
     return loop._replace(noise=columns * (share * floor / size).mid() if size > 0 else columns)
 
 
-def random_loop(rng: np.random.Generator) -> Loop:
-    """Return a loop with at most three states and three consecutive losses."""
+def _with_a_threshold(rng: np.random.Generator) -> Loop:
     n, m = int(rng.integers(1, 4)), 1
     A, B = np.round(rng.normal(size=(n, n)), 3), np.round(rng.normal(size=(n, m)) + 0.5, 3)
     gain = np.round(-B.T @ solve_continuous_are(A, B, np.eye(n), np.eye(m)), 3)
@@ -74,9 +75,9 @@ def random_loop(rng: np.random.Generator) -> Loop:
     )
 
 
-def random_loop_with_long_delays(rng: np.random.Generator) -> Loop:
+def _with_long_delays(rng: np.random.Generator) -> Loop:
     """Return a loop of one state: delays up to four tests, events before the first input, several rules."""
-    while (loop := random_loop(rng)).n > 1:
+    while (loop := _with_a_threshold(rng)).n > 1:
         pass
     sampling, least = loop.times.sampling, loop.times.least_sampling
     delay, start = (sampling * fmpq(int(rng.integers(low, 9)), 2) for low in (1, 0))
@@ -94,9 +95,9 @@ def random_loop_with_long_delays(rng: np.random.Generator) -> Loop:
     return loop._replace(rule=rule, times=times)
 
 
-def random_quadratic_loop(rng: np.random.Generator) -> Loop:
+def _quadratic(rng: np.random.Generator) -> Loop:
     """Return a loop whose rule is a quadratic form with mixed terms, sometimes with noise."""
-    loop = random_loop(rng)
+    loop = _with_a_threshold(rng)
     n = loop.n
     of_errors, mixed = rng.normal(size=(n, n)), 0.02 * rng.normal(size=(n, n))
     positive = np.hstack([mixed, of_errors @ of_errors.T + 0.3 * np.eye(n)]).round(3)
@@ -106,19 +107,35 @@ def random_quadratic_loop(rng: np.random.Generator) -> Loop:
     return loop._replace(rule=rule, noise=noise)
 
 
-def random_due_loop(rng: np.random.Generator) -> Loop:
+def _due(rng: np.random.Generator) -> Loop:
     """Return a loop with a deadline, of a threshold that alone would bound little."""
-    loop = random_loop(rng)
+    loop = _with_a_threshold(rng)
     rule = loop.rule._replace(always=True, level=arb(0), floor=number(2.0))
     longest = loop.times.sampling * int(rng.integers(2, 12))
     due = min(loop.times.least_sampling * int(rng.integers(0, 12)), longest)
     return loop._replace(rule=rule, times=loop.times._replace(due=due, longest=longest))
 
 
-def random_area_loop(rng: np.random.Generator) -> Loop:
+def _area(rng: np.random.Generator) -> Loop:
     """Return a loop whose rule integrates the error, sometimes with noise."""
-    loop = random_loop(rng)
+    loop = _with_a_threshold(rng)
     area = 0.05 * float(rng.integers(1, 10)) * float(loop.times.sampling.p) / float(loop.times.sampling.q)
     rule = loop.rule._replace(integrates=True, level=arb(0), floor=number(round(area, 6)))
     noise = number(0.003) * identity(loop.n) if rng.random() < 0.3 else loop.noise
     return loop._replace(rule=rule, noise=noise)
+
+
+KINDS: dict[str, Callable[[np.random.Generator], Loop]] = {
+    "threshold": _with_a_threshold,
+    "periodic": _periodic,
+    "noisy": _noisy,
+    "long delays": _with_long_delays,
+    "quadratic": _quadratic,
+    "deadline": _due,
+    "area": _area,
+}
+
+
+def random_loop(rng: np.random.Generator, kind: str = "threshold") -> Loop:
+    """Return a loop of a kind, with at most three states and three consecutive losses."""
+    return KINDS[kind](rng)

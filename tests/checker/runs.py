@@ -4,18 +4,23 @@ Nothing of the checker's model is used: x, x_s and x_c are integrated, not the e
 """
 
 import functools
+from collections.abc import Iterable
 from itertools import count
 from typing import NamedTuple
 
 import numpy as np
+from flint import fmpq
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from noack_check.balls import number
 from noack_check.loop import Loop
 from noack_check.proof import Proof
 
 Array = NDArray[np.float64]
 _ROUNDING = 1e-9
+_SECONDS, _LESS = 3.0, 0.9
+"""Of runs within several proofs; and the share of a threshold of which its tests are."""
 _PARTS = 5
 """Of the period of a periodic rule: ages and disturbances may change after each."""
 
@@ -173,6 +178,34 @@ def exceeded(
             if rng.random() < 0.05:
                 signs = tuple(rng.choice([-1.0, 1.0], len(loop.sizes)))
     return found
+
+
+def longest(times: Iterable[fmpq | None]) -> fmpq | None:
+    return max((time for time in times if time is not None), default=None)
+
+
+def played(loop: Loop) -> Loop:
+    """Return a loop as runs have it: tests at all times are often, for a little less than the threshold."""
+    if loop.times.sampling > 0:
+        return loop
+    rule, step = loop.rule, fmpq(1, 500)
+    less = rule._replace(level=number(_LESS) * rule.level, floor=number(_LESS) * rule.floor)
+    return loop._replace(rule=less, times=loop.times._replace(sampling=step, least_sampling=step))
+
+
+def require_true(loop: Loop, proofs: list[Proof], seed: int) -> None:
+    """Require that runs stay within the least of some proofs of one loop."""
+    kinds = {(float(proof.rate.mid()), proof.is_quiet) for proof in proofs}
+    for rate, is_quiet in kinds:
+        alike = [each for each in proofs if (float(each.rate.mid()), each.is_quiet) == (rate, is_quiet)]
+        together = alike[0]._replace(
+            bounds=tuple(bound for proof in alike for bound in proof.bounds),
+            inter_event=longest(proof.inter_event for proof in alike),
+            first_event=longest(proof.first_event for proof in alike),
+        )
+        for k in range(2):
+            rng = np.random.default_rng((seed, k))
+            assert exceeded(played(loop), together, rng, _SECONDS, by_forms=False) == []
 
 
 class _Memory:

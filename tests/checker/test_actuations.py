@@ -8,11 +8,13 @@ import pytest
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
+from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.witnesses.documents import witness_by_gains
 from noack.theory.witnesses.effort import NoWitnessError
+from noack.theory.witnesses.outward import proven_bounds
 from noack_check.keys import RefusedError
-from noack_check.proof import Proof
 from noack_check.scenario import read_linear_loop, read_loop
+from tests.helpers.bound_shares import share_of_bound
 from tests.helpers.resolved_tables import resolved_tables
 from tests.helpers.shipped import shipped
 
@@ -20,13 +22,13 @@ NAMES = ("unstable_pendulum", "double_integrator")
 SETTINGS = ("horizon_s=6.0", 'network.loss={model="bernoulli", probability=0.8}')
 
 
-def proven(name: str, *settings: str) -> Proof:
+def proven(name: str, *settings: str) -> ProvenBounds:
     loop = read_loop(resolved_tables(name, *SETTINGS, *settings), box=False, ideal=False)
-    return witness_by_gains(loop, ("x", "e_s", "e_c")).proof
+    return proven_bounds(witness_by_gains(loop, ("x", "e_s", "e_c")).proof, loop)
 
 
-def sizes(proof: Proof) -> dict[str, float]:
-    return {b.output: float(b.decaying + b.constant) for b in proof.bounds if b.from_start}
+def sizes(bounds: ProvenBounds) -> dict[str, float]:
+    return {output: sum(bound) for output, bound in bounds.bounds.items()}
 
 
 def drawn(seed: int) -> tuple[str, ...]:
@@ -45,16 +47,12 @@ def drawn(seed: int) -> tuple[str, ...]:
 def test_runs_that_lose_inputs_do_not_exceed_what_is_proven(name: str) -> None:
     largest = dict.fromkeys(("x", "e_s"), 0.0)
     for seed in range(4):
-        proof, record = proven(name, *drawn(seed)), simulate(resolve(shipped(name, *SETTINGS, *drawn(seed))))
+        record = simulate(resolve(shipped(name, *SETTINGS, *drawn(seed))))
         plant, sensor = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
         values = {"x": (plant["t_ns"], plant["x"]), "e_s": (sensor["t_ns"], sensor["x_s"] - sensor["x"])}
-        for bound in proof.bounds:
-            if bound.from_start and bound.output in values:
-                t_ns, rows = values[bound.output]
-                fading = np.exp(-float(proof.rate) * t_ns * 1e-9)
-                limits = float(bound.decaying) * fading + float(bound.constant)
-                share = float((np.linalg.norm(rows, axis=1) / limits).max())
-                largest[bound.output] = max(largest[bound.output], share)
+        bounds = proven(name, *drawn(seed))
+        for output, of_run in values.items():
+            largest[output] = max(largest[output], share_of_bound(bounds, output, *of_run))
     assert 0.1 < max(largest.values()) <= 1
 
 

@@ -14,29 +14,13 @@ from noack_check.apart import _sum_of_vectors, reached, share_of_threshold
 from noack_check.balls import beside, identity, matrix, number, square, zeros
 from noack_check.check import RejectedError
 from noack_check.gains import Gains
-from noack_check.loop import Loop, Times
+from noack_check.loop import Loop
 from noack_check.proof import Proof, prove
+from tests.checker.loops import IDEAL, NOISE, SCHEDULE, changed, scalar, steady
 from tests.checker.shortest import shortest_times
-from tests.checker.test_gains import changed, scalar
-from tests.checker.test_witnesses import IDEAL, SCHEDULE
 
 _NEAR = 0.97
 """The share of the least time of a run that is proven, at least."""
-NOISE = number(0.05) * identity(1)
-
-
-def steady(losses: int, *, level: float = 0.0, disturbance: float = 0.05, times: Times = IDEAL) -> Loop:
-    """Return ẋ = x + 2u + d, u = −0.505 x, and the same model: errors of lost updates nearly stay.
-
-    The threshold is max(level e^{−0.005t}, 1).
-    """
-    loop = scalar(losses, times, level=level, floor=1.0)
-    return loop._replace(
-        gain=number(-0.505) * identity(1),
-        pushes=identity(1),
-        sizes=(number(disturbance),),
-        rule=loop.rule._replace(rate=number(0.005)),
-    )
 
 
 def proven(loop: Loop) -> tuple[dict[str, Any], Proof]:

@@ -5,64 +5,47 @@ import pytest
 from flint import arb, fmpq
 from scipy.linalg import expm
 
-from noack.theory.witnesses.documents import Witness, find_witness
 from noack_check.balls import identity, matrix, number
 from noack_check.check import RejectedError
-from noack_check.loop import Loop
 from noack_check.model import Chain, Errors, Model
 from noack_check.proof import error_without_input, prove
 from tests.checker.completed import completed
+from tests.checker.loops import ASSUMED, SCHEDULE, bounds_of, changed, double_integrator
+from tests.checker.proofs import Proved, proved
 from tests.checker.runs import exceeded, floats
-from tests.checker.test_witnesses import SCHEDULE, bounds_of, double_integrator
-
-LOOPS = {
-    "holds": double_integrator(floor=0.02, level=0.0)._replace(holds=True),
-    "holds, threshold decays": double_integrator(floor=0.01)._replace(holds=True),
-    "deadline": double_integrator(floor=0.01)._replace(
-        rule=double_integrator(floor=0.01).rule._replace(always=True)
-    ),
-}
 
 
-@pytest.fixture(scope="module", params=LOOPS)
-def found(request: pytest.FixtureRequest) -> tuple[Loop, Witness]:
-    loop = LOOPS[request.param]
-    return loop, find_witness(loop)
+@pytest.fixture(scope="module", params=ASSUMED)
+def found(request: pytest.FixtureRequest) -> Proved:
+    return proved(request.param)
 
 
-def test_runs_under_the_schedule_stay_below_the_bounds(found: tuple[Loop, Witness]) -> None:
-    loop, witness = found
-    assert 1.0 <= bounds_of(witness)["x"] < 1.8
+def test_runs_under_the_schedule_stay_below_the_bounds(found: Proved) -> None:
+    assert 1.0 <= bounds_of(found.proof)["x"] < 1.8
     for seed in range(6):
-        assert not exceeded(loop, witness.proof, np.random.default_rng(seed), 4.0)
+        assert not exceeded(found.loop, found.proof, np.random.default_rng(seed), 4.0)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.97])
-def test_errors_below_those_that_are_proven_are_rejected(found: tuple[Loop, Witness], share: float) -> None:
-    loop, witness = found
-    sensor = next(bound for bound in witness.proof.bounds if bound.output == "e_s")
+def test_errors_below_those_that_are_proven_are_rejected(found: Proved, share: float) -> None:
+    sensor = next(bound for bound in found.proof.bounds if bound.output == "e_s")
     errors = {name: share * float(getattr(sensor, name)) for name in ("decaying", "constant")}
     with pytest.raises(RejectedError, match="errors: the sensor's error may exceed them"):
-        prove(loop, {**witness.document, "errors": errors})
+        prove(found.loop, {**found.document, "errors": errors})
 
 
-def test_larger_errors_are_not_covered_by_the_same_forms(found: tuple[Loop, Witness]) -> None:
-    loop, witness = found
-    assumed = witness.document["errors"]
-    assert isinstance(assumed, dict)
+def test_larger_errors_are_not_covered_by_the_same_forms(found: Proved) -> None:
+    larger = {name: 1.5 * size for name, size in found.document["errors"].items()}
     with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
-        prove(loop, {**witness.document, "errors": {name: 1.5 * size for name, size in assumed.items()}})
+        prove(found.loop, {**found.document, "errors": larger})
 
 
 @pytest.mark.parametrize("change", ["slower tests", "later updates", "more losses", "another plant"])
-def test_a_witness_proves_nothing_about_another_loop(found: tuple[Loop, Witness], change: str) -> None:
-    loop, witness = found
-    times = loop.times
-    changed = {
-        "slower tests": loop._replace(
-            times=times._replace(sampling=3 * times.sampling, least_sampling=3 * times.sampling)
-        ),
-        "later updates": loop._replace(times=times._replace(delay=times.delay + fmpq(1, 50))),
+def test_a_witness_proves_nothing_about_another_loop(found: Proved, change: str) -> None:
+    loop, times = found.loop, found.loop.times
+    other = {
+        "slower tests": changed(loop, sampling=3 * times.sampling, least_sampling=3 * times.sampling),
+        "later updates": changed(loop, delay=times.delay + fmpq(1, 50)),
         "more losses": loop._replace(losses=loop.losses + 2),
         "another plant": loop._replace(B=2 * loop.B),
     }[change]
@@ -73,7 +56,7 @@ def test_a_witness_proves_nothing_about_another_loop(found: tuple[Loop, Witness]
         "another plant": "x: flow/0 lost/",
     }[change]
     with pytest.raises(RejectedError, match=f"^({reason})"):
-        prove(changed, completed(changed, witness.document))
+        prove(other, completed(other, found.document))
 
 
 def test_facts_about_errors_bound_those_of_each_location() -> None:

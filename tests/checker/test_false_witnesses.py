@@ -25,7 +25,7 @@ Eight conditions are easily left out. Tests here and in :mod:`tests.checker.test
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -33,12 +33,11 @@ import pytest
 from flint import arb, fmpq
 
 from noack.theory.witnesses.assumptions import inter_event_s
-from noack.theory.witnesses.documents import Witness, find_witness
-from noack_check.balls import identity, is_positive, matrix, number, zeros
-from noack_check.check import RejectedError, _value
+from noack_check.balls import identity, matrix, number, zeros
+from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop, Rule
-from noack_check.model import Model, thresholds
+from noack_check.model import thresholds
 from noack_check.norms import decays_below, growth
 from noack_check.proof import (
     Assumptions,
@@ -55,25 +54,28 @@ from noack_check.proof import (
 )
 from noack_check.scenario import _checked
 from noack_check.sentences import formula, sentences
-from noack_check.times import Schedule
 from tests.checker.completed import completed
+from tests.checker.loops import (
+    IDEAL,
+    SCHEDULE,
+    changed,
+    double_integrator,
+    early,
+    pushed,
+    until_due,
+    with_rule,
+)
+from tests.checker.proofs import UNTIL_IT_ACTS, Proved, proved
+from tests.checker.rejections import failing, rejects
 from tests.checker.runs import exceeded
-from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
 
+Document = dict[str, Any]
 DEFAULT = double_integrator()
 
 
 @pytest.fixture(scope="module")
-def witness() -> Witness:
-    return find_witness(double_integrator())
-
-
-def rejects(loop: Loop, document: object, match: str) -> None:
-    """Require that a document is rejected, and for the reason that is meant."""
-    with pytest.raises(RejectedError, match=match) as caught:
-        prove(loop, document)  # type: ignore[arg-type]
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) <= 300
+def witness() -> Proved:
+    return proved("double_integrator")
 
 
 # Loops whose numbers are balls or contradict each other.
@@ -82,9 +84,8 @@ def rejects(loop: Loop, document: object, match: str) -> None:
 def test_a_level_counts_beside_a_floor_at_rate_0() -> None:
     """With a rate of 0, f₁ = f₂ = 1, but c² f₁² + f² f₂² is not f² f₂²: x is driven by errors up to c."""
     sizes = []
-    for floor in (0.01, 0.0):
-        loop = double_integrator(IDEAL, level=0.05, floor=floor)
-        found = find_witness(loop._replace(rule=loop.rule._replace(rate=arb(0))))
+    for name in ("rate_0_floor", "rate_0"):
+        found = proved(name)
         assert found.document["rate"] == 0
         drift = next(bound for bound in found.proof.bounds if bound.output == "drift")
         sizes.append(math.hypot(float(drift.decaying.mid()), float(drift.constant.mid())))
@@ -94,9 +95,8 @@ def test_a_level_counts_beside_a_floor_at_rate_0() -> None:
 @pytest.mark.parametrize("field", ["half_A", "half_B"])
 def test_a_half_width_that_is_a_ball_around_0_is_not_left_out(field: str) -> None:
     ball = identity(2) * arb(0, 0.3) if field == "half_A" else matrix([[1.0], [1.0]]) * arb(0, 0.3)
-    loop = double_integrator(IDEAL)
-    document = find_witness(loop).document
-    rejects(loop._replace(**{field: ball}), document, "loop: half-width")
+    ideal = proved("ideal")
+    rejects(ideal.loop._replace(**{field: ball}), ideal.document, "loop: half-width")
 
 
 WRONG: dict[str, Callable[[Loop], Loop]] = {
@@ -120,18 +120,18 @@ WRONG: dict[str, Callable[[Loop], Loop]] = {
 
 
 @pytest.mark.parametrize("change", WRONG)
-def test_a_loop_that_is_none_is_rejected(witness: Witness, change: str) -> None:
+def test_a_loop_that_is_none_is_rejected(witness: Proved, change: str) -> None:
     rejects(WRONG[change](DEFAULT), witness.document, "^loop: ")
 
 
 def test_a_rule_that_holds_at_once_after_an_event_needs_tests_at_intervals() -> None:
     """Its event sets e := 0, but not x: that the rule is silent between events would be false."""
-    loop = double_integrator(IDEAL)
-    rule = loop.rule._replace(positive=matrix([[1, 0, 1, 0], [0, 0, 0, 1]]))
-    rejects(loop._replace(rule=rule), find_witness(loop).document, "at once after an event")
+    ideal = proved("ideal")
+    loop = with_rule(ideal.loop, positive=matrix([[1, 0, 1, 0], [0, 0, 0, 1]]))
+    rejects(loop, ideal.document, "at once after an event")
 
 
-def test_a_weight_without_inverse_is_rejected(witness: Witness) -> None:
+def test_a_weight_without_inverse_is_rejected(witness: Proved) -> None:
     rejects(DEFAULT._replace(weight=matrix([[1, 0], [0, 0]])), witness.document, "inverse")
 
 
@@ -201,27 +201,21 @@ def test_no_time_between_events_is_searched_if_the_threshold_decays_and_the_drif
 # The time before the first input.
 
 
-def early(level: float) -> Loop:
-    """Return a loop whose first input acts before the first test, at which e_s may be above the threshold."""
-    times = SCHEDULE._replace(delay=fmpq(1, 100), age=fmpq(1, 50), start=fmpq(1, 100))
-    return double_integrator(times, level=level)
-
-
 def test_the_sensor_error_before_the_first_input_is_bounded() -> None:
     """Without an input ‖e_s‖ = ‖∫ e^{Hs} BKx‖ is near 0.01 at 0.01 s."""
-    proof = find_witness(early(0.005)).proof
+    proof = proved("early_0.005").proof
     sensor = next(bound for bound in proof.bounds if bound.output == "e_s")
     assert float(sensor.decaying.mid()) > 0.0099
 
 
 def test_the_first_event_may_come_earlier_than_others_do() -> None:
-    by_forms = {name: part for name, part in find_witness(early(0.05)).document.items() if name != "gains"}
+    by_forms = without_gains(proved("early_0.05"))
     proof = prove(early(0.05), by_forms)
     assert proof.first_event is not None
     assert proof.inter_event is not None
     assert proof.first_event < proof.inter_event
-    changed = {**by_forms, "first_event_s": by_forms["inter_event_s"]}
-    rejects(early(0.05), changed, "first_event_s")
+    later = {**by_forms, "first_event_s": by_forms["inter_event_s"]}
+    rejects(early(0.05), later, "first_event_s")
 
 
 def test_events_without_a_comparison_may_come_before_the_first_input() -> None:
@@ -235,16 +229,13 @@ def test_events_without_a_comparison_may_come_before_the_first_input() -> None:
 
 def test_no_time_between_events_is_as_long_as_until_one_is_due() -> None:
     """The test at this time may be an event, whatever is compared."""
-    plain = double_integrator()
-    due = fmpq(int(500 * float(str(find_witness(plain).document["inter_event_s"]))), 1000)
-    times = plain.times._replace(due=due)
-    loop = plain._replace(rule=plain.rule._replace(always=True), times=times)
-    document = find_witness(loop).document
-    apart = float(str(document["inter_event_s"]))
+    loop, document = until_due(), proved("until_due").document
+    due, apart = loop.times.due, document["inter_event_s"]
+    assert proved("double_integrator").document["inter_event_s"] > float(arb(due))
     assert 0.999 < apart / float(arb(due)) < 1
     rejects(loop, {**document, "inter_event_s": float(arb(due))}, "without a comparison may come earlier")
     rejects(loop, {**document, "first_event_s": float(arb(due))}, "without a comparison may come earlier")
-    rejects(loop._replace(times=times._replace(due=due / 2)), document, "without a comparison")
+    rejects(changed(loop, due=due / 2), document, "without a comparison")
 
 
 def test_a_start_is_quiet_only_if_the_error_is_what_is_compared() -> None:
@@ -260,7 +251,7 @@ def test_a_start_is_quiet_only_if_the_error_is_what_is_compared() -> None:
             require_few_at_start(loop._replace(rule=rule._replace(positive=each)), few)
 
 
-def test_a_start_in_which_an_event_may_come_is_rejected(witness: Witness) -> None:
+def test_a_start_in_which_an_event_may_come_is_rejected(witness: Proved) -> None:
     rejects(DEFAULT._replace(times=SCHEDULE._replace(start=fmpq(1, 2))), witness.document, "^x: flow/start,")
 
 
@@ -298,22 +289,22 @@ def test_two_units_that_do_not_decay_are_joined() -> None:
 # Conditions without which the statements would be false.
 
 
-def entry_of(document: dict, output: str) -> dict:  # type: ignore[type-arg]
+def entry_of(document: Document, output: str) -> Document:
     return next(entry for entry in document["bounds"] if entry["output"] == output)
 
 
-def changed(witness: Witness) -> dict:  # type: ignore[type-arg]
-    return copy.deepcopy(dict(witness.document))
+def copied(witness: Proved) -> Document:
+    return copy.deepcopy(witness.document)
 
 
-def without_gains(witness: Witness) -> dict:  # type: ignore[type-arg]
+def without_gains(witness: Proved) -> Document:
     return {key: value for key, value in witness.document.items() if key != "gains"}
 
 
-def test_the_chain_has_one_more_update_where_updates_take_time(witness: Witness) -> None:
+def test_the_chain_has_one_more_update_where_updates_take_time(witness: Proved) -> None:
     proof = prove(double_integrator(), without_gains(witness))
     bounds = {bound.output: float(bound.decaying.mid()) for bound in proof.bounds}
-    gain = witness.document["chain"]["gain"]  # type: ignore[index]
+    gain = witness.document["chain"]["gain"]
     recent = float(growth(weighted(DEFAULT, number(0.3)), arb(DEFAULT.times.delay))[0])
     assert 1 < recent < gain
     assert bounds["e_c"] == pytest.approx((1 + 2 * gain + recent) * bounds["e_s"])
@@ -321,8 +312,8 @@ def test_the_chain_has_one_more_update_where_updates_take_time(witness: Witness)
 
 def test_later_events_are_those_that_tests_or_the_drift_allow() -> None:
     """Events are some 0.04 s apart, tests 0.01 s: within 0.1 s there are more than none, 2 at most."""
-    loop = double_integrator(SCHEDULE._replace(delay=fmpq(1, 10)))
-    found = find_witness(loop)
+    found = proved("delay_0.1")
+    loop = found.loop
     later = found.document["later"]
     assert isinstance(later, int)
     assert later > 0
@@ -333,12 +324,9 @@ def test_later_events_are_those_that_tests_or_the_drift_allow() -> None:
 
 
 def test_an_update_is_on_its_way_until_an_input_from_it_acts() -> None:
-    """It is 10 ms in the network, waits up to 20 ms for a tick, whose input acts at the next step."""
-    network, until_it_acts = fmpq(1, 100), Schedule(100.0, 1, 50.0, 0.0, 0, 0.01).times.delay
-    assert until_it_acts >= network + fmpq(1, 50)
-    alone, loop = (double_integrator(SCHEDULE._replace(delay=time)) for time in (network, until_it_acts))
-    rejects(loop, find_witness(alone).document, "^x: flow/0 later/")
-    prove(loop, find_witness(loop).document)
+    """It is 10 ms in the network, and waits up to 20 ms for a tick."""
+    assert fmpq(1, 100) + fmpq(1, 50) <= UNTIL_IT_ACTS
+    rejects(proved("until_it_acts").loop, proved("delay_0.01").document, "^x: flow/0 later/")
 
 
 def test_later_events_by_tests_need_no_bound_of_the_drift() -> None:
@@ -363,7 +351,7 @@ def test_the_start_has_as_many_events_as_tests() -> None:
 
 
 @pytest.mark.parametrize("size", [0.0, 0.02, 0.05])
-def test_the_errors_have_to_reproduce_themselves(witness: Witness, size: float) -> None:
+def test_the_errors_have_to_reproduce_themselves(witness: Proved, size: float) -> None:
     """The threshold is 0.05, and e_s grows beyond it between two tests."""
     document = completed(DEFAULT, {**witness.document, "errors": {"decaying": size, "constant": 0.0}})
     rejects(DEFAULT, document, "^errors: the sensor's error may exceed them")
@@ -371,24 +359,24 @@ def test_the_errors_have_to_reproduce_themselves(witness: Witness, size: float) 
 
 
 @pytest.mark.parametrize("sizes", [(1.0, 1.0), (-2.0, 0.0), (0.0, -2.0)])
-def test_errors_have_the_units_of_the_loop(witness: Witness, sizes: tuple[float, float]) -> None:
+def test_errors_have_the_units_of_the_loop(witness: Proved, sizes: tuple[float, float]) -> None:
     errors = dict(zip(("decaying", "constant"), sizes, strict=True))
     rejects(DEFAULT, {**witness.document, "errors": errors}, "^errors: below 0, or in a unit")
 
 
-def test_the_errors_need_the_chain(witness: Witness) -> None:
+def test_the_errors_need_the_chain(witness: Proved) -> None:
     document = {key: value for key, value in witness.document.items() if key != "chain"}
     rejects(DEFAULT, {**document, "errors": {"decaying": 2.0, "constant": 0.0}}, "need the chain")
 
 
 @pytest.mark.parametrize("value", [-1, 9, 1.0, True, "1", None])
-def test_the_number_of_later_events_is_a_small_whole_number(witness: Witness, value: object) -> None:
+def test_the_number_of_later_events_is_a_small_whole_number(witness: Proved, value: object) -> None:
     rejects(DEFAULT, {**witness.document, "later": value}, "later: not a whole number")
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.9, 0.999, -1.0])
-def test_the_gain_of_the_chain_is_proven(witness: Witness, factor: float) -> None:
-    document = changed(witness)
+def test_the_gain_of_the_chain_is_proven(witness: Proved, factor: float) -> None:
+    document = copied(witness)
     document["chain"]["gain"] *= factor
     rejects(DEFAULT, document, "^chain: the growth of the model's error is not below its gain")
 
@@ -405,30 +393,21 @@ def test_a_tail_that_is_zero_proves_no_decay() -> None:
         *((value, "^decay: not a number") for value in (True, "1", None)),
     ],
 )
-def test_forms_decay_faster_than_the_threshold(witness: Witness, decay: object, reason: str) -> None:
-    document = changed(witness)
+def test_forms_decay_faster_than_the_threshold(witness: Proved, decay: object, reason: str) -> None:
+    document = copied(witness)
     entry_of(document, "x")["decay"] = decay
     rejects(DEFAULT, document, reason)
 
 
 @pytest.mark.parametrize("rate", [-0.1, 0.31, 1e300])
-def test_the_rate_is_at_most_that_of_the_threshold(witness: Witness, rate: float) -> None:
+def test_the_rate_is_at_most_that_of_the_threshold(witness: Proved, rate: float) -> None:
     rejects(DEFAULT, {**witness.document, "rate": rate}, "^rate: not between 0 and that of the threshold")
 
 
-def test_a_threshold_of_another_rate_than_the_bounds_is_no_guard(witness: Witness) -> None:
+def test_a_threshold_of_another_rate_than_the_bounds_is_no_guard(witness: Proved) -> None:
     """At an event ‖W e_s‖ is above the loop's threshold, not above the level times e^{−rt}."""
     document = completed(DEFAULT, {**witness.document, "rate": 5e-324})
     rejects(DEFAULT, document, "^x: edge/0 later, all lost/")
-
-
-def failing(loop: Loop, entry: Mapping[str, Any], rate: float) -> set[str]:
-    """Return the names of all inequalities that fail."""
-    model = Model(loop, number(rate), number(entry["decay"]))
-    matrices = {name: matrix(rows) for name, rows in entry["matrices"].items()}
-    numbers = {name: number(value) for name, value in entry["numbers"].items()}
-    every = model.inequalities(entry["output"], starts=True)
-    return {item.name for item in every if not is_positive(_value(item, matrices, numbers))}
 
 
 @pytest.mark.parametrize(
@@ -448,9 +427,9 @@ def failing(loop: Loop, entry: Mapping[str, Any], rate: float) -> set[str]:
         ("level 1", -0.1, "output/0 lost/0/0"),
     ],
 )
-def test_edges_hold_at_each_node(witness: Witness, name: str, by: float, fails: str) -> None:
+def test_edges_hold_at_each_node(witness: Proved, name: str, by: float, fails: str) -> None:
     """V is changed at one node: the edges into it or out of it fail."""
-    document = changed(witness)
+    document = copied(witness)
     entry = entry_of(document, "x")
     assert not failing(DEFAULT, entry, 0.3)
     entry["numbers"][name] += by * abs(entry["numbers"][name])
@@ -459,14 +438,12 @@ def test_edges_hold_at_each_node(witness: Witness, name: str, by: float, fails: 
 
 
 def test_a_constant_disturbance_needs_constant_bounds() -> None:
-    loop = double_integrator(IDEAL)
-    with_push = loop._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(1e-6),))
+    with_push = pushed(double_integrator(IDEAL), 1e-6)
     for signal in (0.0, 1e-6, 1e-3, 1.0):
-        document = completed(with_push, find_witness(loop).document, signal)
+        document = completed(with_push, proved("ideal").document, signal)
         assert entry_of(document, "x")["numbers"]["level 2"] == 0
         rejects(with_push, document, "^x: flow/0 lost/")
-    document = changed(find_witness(with_push))
-    prove(with_push, document)
+    document = copied(proved("ideal_pushed"))
     entry_of(document, "x")["numbers"]["level 2"] = 0.0
     rejects(with_push, document, "^x: output/0 lost/")
 
@@ -500,7 +477,7 @@ HOSTILE: dict[str, tuple[object, str]] = {
     "a large matrix": (
         {
             "rate": 0.3,
-            "bounds": [{"output": "x", "decay": 1, "matrices": {"X": [[0.0] * 2000] * 2000}, "numbers": {}}],
+            "bounds": [{"output": "x", "decay": 1, "matrices": {"X": [[0.0] * 300] * 300}, "numbers": {}}],
         },
         "^x: X: not a square matrix of the right size",
     ),
@@ -525,15 +502,15 @@ def test_hostile_documents_are_one_line(name: str) -> None:
     rejects(DEFAULT, document, reason)
 
 
-def test_an_output_occurs_once(witness: Witness) -> None:
-    document = changed(witness)
+def test_an_output_occurs_once(witness: Proved) -> None:
+    document = copied(witness)
     document["bounds"] *= 1000
     rejects(DEFAULT, document, "occurs twice")
 
 
 @pytest.mark.parametrize("value", [True, "1", None, math.nan, math.inf, [1], 2**70, -1.0])
-def test_a_multiplier_is_a_number_of_at_least_0(witness: Witness, value: object) -> None:
-    document = changed(witness)
+def test_a_multiplier_is_a_number_of_at_least_0(witness: Proved, value: object) -> None:
+    document = copied(witness)
     numbers = entry_of(document, "x")["numbers"]
     numbers[next(name for name in numbers if name.startswith("m/"))] = value
     rejects(DEFAULT, document, "x: |not ")
@@ -542,8 +519,8 @@ def test_a_multiplier_is_a_number_of_at_least_0(witness: Witness, value: object)
 @pytest.mark.parametrize(
     "value", [[], [[]], [[1]], [[1, 2]], [[1, 2], [3, 4]], [["1", 0], [0, 1]], "ab", [1, 2]]
 )
-def test_a_matrix_is_square_symmetric_and_of_the_right_size(witness: Witness, value: object) -> None:
-    document = changed(witness)
+def test_a_matrix_is_square_symmetric_and_of_the_right_size(witness: Proved, value: object) -> None:
+    document = copied(witness)
     entry_of(document, "x")["matrices"]["X"] = value
     rejects(DEFAULT, document, "X")
 

@@ -177,7 +177,7 @@ def changed_document(document: Mapping[str, object], rng: np.random.Generator) -
     return changed
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.system) for seed in range(1, 9))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.deep) for seed in range(1, 9))])
 def test_what_is_accepted_of_changed_witnesses_is_true(seed: int) -> None:
     rng = np.random.default_rng(seed)
     resolved = scenario(*SMALL)

@@ -24,7 +24,10 @@ from noack_check.keys import RefusedError
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
 from tests.checker.completed import completed
+from tests.checker.loops import FILTERED_MASS
+from tests.checker.proofs import proved
 from tests.checker.runs import exceeded, floats
+from tests.helpers.bound_shares import share_of_bound
 from tests.helpers.resolved_tables import first_loop, resolved_tables, tables_of
 from tests.helpers.shipped import shipped
 
@@ -182,19 +185,12 @@ def test_the_pendulum_has_proven_bounds(statement: WitnessedStatement) -> None:
 
 # Its bounds are those by gains, which the checker derives by itself. Quadratic forms are of one loop only.
 
-MASS = (
-    "plant={initial_state=[1.0,0.0],rate_hz=100.0,measurement={C=[[1.0,0.0]],noise_bound=[0.0005]}}",
-    'observer={kind="kalman",process_std=[0.0,2.0],noise_std=[0.01],initial_std=[0.02,0.2],initial_estimate=[0.99,0.01]}',
-    "controller.rate_hz=100", "trigger.beta=0.1", "trigger.floor=0.05", "network.mansd=1",
-)  # fmt: skip
+MASS = FILTERED_MASS
 
 
 @pytest.fixture(scope="module")
 def document() -> Document:
-    found = find_statement(first_loop("double_integrator", *MASS), "own", "schedule").document
-    assert found is not None
-    assert "bounds" in found
-    return found
+    return proved("filtered_mass").document
 
 
 CHANGES = {
@@ -247,18 +243,16 @@ def test_gains_that_rounding_moves_have_no_proof(monkeypatch: pytest.MonkeyPatch
 def test_no_simulated_run_exceeds_the_bounds(statement: WitnessedStatement) -> None:
     """The runs are those of noack's machines, of which the checker has nothing."""
     assert statement.bounds is not None
-    rate, largest = statement.bounds.rate_per_s, 0.0
-    for seed in range(6):
+    largest = 0.0
+    for seed in range(4):
         settings = (f"seeds.{key}={seed}" for key in ("loss", "disturbance", "noise"))
         loss = f"network.loss.probability={0.3 + 0.1 * seed}"
         run = simulate(resolve(shipped(SCENARIO, OFTEN, loss, "horizon_s=4.0", *settings)))
         plant, measured = run[PLANT_STEP], run[SENSOR_MEASUREMENT]
-        x = plant["x"][np.searchsorted(plant["t_ns"], measured["t_ns"])]
-        f1 = np.exp(-rate * measured["t_ns"] * 1e-9)
-        for name, size in (("x", x), ("estimate", measured["x"] - x)):
-            bound = statement.bounds.bounds[name]
-            limit = bound.decaying * f1 + bound.constant
-            largest = max(largest, float((np.linalg.norm(size, axis=1) / limit).max()))
+        t_ns = measured["t_ns"]
+        x = plant["x"][np.searchsorted(plant["t_ns"], t_ns)]
+        for name, rows in (("x", x), ("estimate", measured["x"] - x)):
+            largest = max(largest, share_of_bound(statement.bounds, name, t_ns, rows))
     assert 0.05 < largest <= 1.0
 
 

@@ -2,11 +2,10 @@
 
 from typing import Any
 
-import numpy as np
 import pytest
 from flint import arb
 
-from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
+from cosim.analysis.witnesses import resolved_content
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
@@ -18,7 +17,9 @@ from noack_check.proof import Bound, conclude, prove, prove_bound, read_assumpti
 from noack_check.scenario import read_loop
 from noack_check.sentences import meaning
 from tests.checker.completed import completed
+from tests.checker.proofs import Proved, proved
 from tests.checker.runs import floats
+from tests.helpers.bound_shares import share_of_bound
 from tests.helpers.resolved_tables import resolved_tables
 from tests.helpers.shipped import resolved, shipped
 
@@ -30,10 +31,8 @@ def motor(*settings: str) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def statement() -> WitnessedStatement:
-    found = find_statement(resolved(MOTOR), "own", "schedule")
-    assert found.proof is not None, found.reason
-    return found
+def statement() -> Proved:
+    return proved("dc_motor_load")
 
 
 def test_a_loop_is_read_about_its_rest() -> None:
@@ -110,28 +109,25 @@ def test_a_rule_that_compares_x_is_rejected_with_loads(trigger: dict[str, Any]) 
     )
 
 
-def test_the_shaft_has_a_proven_bound(statement: WitnessedStatement) -> None:
-    assert statement.bounds is not None
+def test_the_shaft_has_a_proven_bound(statement: Proved) -> None:
     bound = statement.bounds.bounds["y[0]"]
     assert bound.constant < 0.1
     assert statement.bounds.inter_event_s is not None
     assert statement.bounds.inter_event_s > 0.004
 
 
-def test_the_input_is_no_output_of_a_loop_about_its_rest(statement: WitnessedStatement) -> None:
+def test_the_input_is_no_output_of_a_loop_about_its_rest(statement: Proved) -> None:
     """It is not 0 at rest, nor what the forms have before the first one acts."""
     loop, document = read_loop(motor(), box=False, ideal=False), statement.document
-    assert document is not None
     rate = read_number(document, "rate")
     assumed, entries = read_assumptions(loop, rate, document), document["bounds"]
-    assert isinstance(entries, list)
     bounds = [prove_bound(loop, rate, entry, assumed) for entry in entries]
     assert conclude(loop, document, assumed, bounds).bounds
     with pytest.raises(RejectedError, match=r"^u: about a reference, or where the loop rests"):
         conclude(loop, document, assumed, [*bounds, Bound("u[0]", arb(1), arb(0), from_start=True)])
 
 
-def test_the_sentences_say_from_where_they_count(statement: WitnessedStatement) -> None:
+def test_the_sentences_say_from_where_they_count(statement: Proved) -> None:
     lines = [*check_file({"scenario": motor(), "statements": [statement.document]}, None)]
     assert any("where the loop rests under its constant loads" in line for line in lines)
     loop = read_loop(resolved_tables("double_integrator"), box=False, ideal=False)
@@ -140,31 +136,27 @@ def test_the_sentences_say_from_where_they_count(statement: WitnessedStatement) 
     assert meaning(tables, loop) == "x and outputs count from the set-point"
 
 
-def test_no_simulated_run_exceeds_it(statement: WitnessedStatement) -> None:
+def test_no_simulated_run_exceeds_it(statement: Proved) -> None:
     """The runs are those of noack's machines, of which the checker has nothing."""
-    assert statement.bounds is not None
-    bound, rate, largest = statement.bounds.bounds["y[0]"], statement.bounds.rate_per_s, 0.0
+    largest = 0.0
     losses = [f"network.loss.probability={p}" for p in (0.0, 0.3, 0.6, 1.0)]
     for seed in range(2):
         for loss in losses:
             run = simulate(resolve(shipped(MOTOR, loss, f"seeds.loss={seed}")))
             rows = run[PLANT_STEP]
-            limit = bound.decaying * np.exp(-rate * rows["t_ns"] * 1e-9) + bound.constant
-            largest = max(largest, float((np.abs(rows["x"][:, 0]) / limit).max()))
+            largest = max(largest, share_of_bound(statement.bounds, "y[0]", rows["t_ns"], rows["x"][:, 0]))
     assert 0.3 < largest <= 1.0
 
 
-def test_the_bound_is_none_of_a_larger_load(statement: WitnessedStatement) -> None:
+def test_the_bound_is_none_of_a_larger_load(statement: Proved) -> None:
     larger = read_loop(motor("plant.load=[2.0]"), box=False, ideal=False)
-    assert statement.document is not None
     with pytest.raises(RejectedError, match=r"^x: flow/start, "):
         prove(larger, completed(larger, statement.document))
 
 
-def test_the_bound_is_none_of_a_slower_observer(statement: WitnessedStatement) -> None:
+def test_the_bound_is_none_of_a_slower_observer(statement: Proved) -> None:
     tables = motor()
     tables["observer"]["gain"][2] = [entry / 10 for entry in tables["observer"]["gain"][2]]
     loop = read_loop(tables, box=False, ideal=False)
-    assert statement.document is not None
     with pytest.raises(RejectedError, match=r"^x: edge/0 lost, "):
         prove(loop, completed(loop, statement.document))

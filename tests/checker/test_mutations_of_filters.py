@@ -24,10 +24,10 @@ from noack_check.loop import Loop, Noise
 from noack_check.noise import noise_of
 from noack_check.proof import Proof, prove, read_assumptions
 from noack_check.scenario import read_loop
-from tests.checker.runs import exceeded, floats
-from tests.checker.test_kalman import MASS, SCENARIO
-from tests.checker.test_mutations import DOCUMENTS
-from tests.checker.test_mutations_of_gains import CHANGES, accepted, places, require_true
+from tests.checker.changes import DOCUMENTS, GAINS, accepted, places
+from tests.checker.loops import FILTERED_MASS
+from tests.checker.proofs import proved
+from tests.checker.runs import exceeded, floats, require_true
 from tests.helpers.resolved_tables import first_loop, tables_of
 
 Array = NDArray[np.float64]
@@ -154,16 +154,19 @@ class Base(NamedTuple):
     document: Tables
 
 
-BASES = {"by gains": (SCENARIO, SETTINGS), "by forms": ("double_integrator", MASS)}
+BASES = {"by gains": ("pendulum_observed", SETTINGS), "by forms": ("double_integrator", FILTERED_MASS)}
 
 
 @functools.cache
 def base(name: str) -> Base:
     resolved = first_loop(BASES[name][0], *BASES[name][1])
-    tables, work = tables_of(resolved), {"most_work": 0} if name == "by gains" else {}
-    found = find_statement(resolved, "own", "schedule", **work).document
-    assert found is not None
-    document = {key: value for key, value in found.items() if key != "gains" or name == "by gains"}
+    tables = tables_of(resolved)
+    if name == "by gains":
+        found = find_statement(resolved, "own", "schedule", most_work=0).document
+        assert found is not None
+        document = found
+    else:
+        document = {key: value for key, value in proved("filtered_mass").document.items() if key != "gains"}
     return Base(tables, read_loop(tables, box=False, ideal=False), document)
 
 
@@ -274,8 +277,8 @@ def changed_scenario(name: str, change: str, rng: Rng) -> Tables:
     ("name", "count", "seconds"),
     [
         ("by gains", 20, 0.1),
-        pytest.param("by gains", 160, _SECONDS, marks=pytest.mark.system),
-        pytest.param("by forms", 100, _SECONDS, marks=pytest.mark.system),
+        pytest.param("by gains", 160, _SECONDS, marks=pytest.mark.deep),
+        pytest.param("by forms", 100, _SECONDS, marks=pytest.mark.deep),
     ],
 )
 def test_changed_scenarios_make_nothing_false_proven(name: str, count: int, seconds: float) -> None:
@@ -307,13 +310,13 @@ def test_changed_scenarios_make_nothing_false_proven(name: str, count: int, seco
     ("name", "count"),
     [
         ("by gains", 8),
-        pytest.param("by gains", 70, marks=pytest.mark.system),
-        pytest.param("by forms", 80, marks=pytest.mark.system),
+        pytest.param("by gains", 70, marks=pytest.mark.deep),
+        pytest.param("by forms", 80, marks=pytest.mark.deep),
     ],
 )
 def test_changed_documents_prove_nothing_false(name: str, count: int) -> None:
     of, rng, rejected = base(name), np.random.default_rng(count), 0
-    changes = [*(CHANGES if name == "by gains" else DOCUMENTS).values()]
+    changes = [*(GAINS if name == "by gains" else DOCUMENTS).values()]
     proofs = [prove(of.loop, of.document)]
     for k in range(count):
         document = copy.deepcopy(of.document)
@@ -328,7 +331,7 @@ def test_changed_documents_prove_nothing_false(name: str, count: int) -> None:
     assert min(rejected, len(proofs)) > count // 8
 
 
-@pytest.mark.parametrize("count", [40, pytest.param(240, marks=pytest.mark.system)])
+@pytest.mark.parametrize("count", [40, pytest.param(240, marks=pytest.mark.deep)])
 def test_any_part_of_the_error_that_decays_smoothly_leaves_a_bound_of_the_rest(count: int) -> None:
     """A document names it, and nothing of it has to be right."""
     of, rng = base("by gains"), np.random.default_rng(count)

@@ -14,15 +14,13 @@ import numpy as np
 import pytest
 from flint import fmpq
 
-from noack.theory.witnesses.documents import find_witness, witness_by_gains
-from noack_check.balls import identity, number
-from noack_check.loop import Loop, Times
+from noack.theory.witnesses.documents import witness_by_gains
+from noack_check.loop import Loop
 from noack_check.proof import Proof, prove
+from tests.checker.changes import DOCUMENTS, GAINS, LOOPS, accepted, all_scaled, places, scaled
+from tests.checker.loops import DRIFTING, IDEAL, NOISE, steady
+from tests.checker.proofs import proved
 from tests.checker.shortest import STEP_S, Shortest, shortest_times
-from tests.checker.test_apart import NOISE, steady
-from tests.checker.test_mutations import DOCUMENTS, LOOPS
-from tests.checker.test_mutations_of_gains import CHANGES, accepted, all_scaled, places, scaled
-from tests.checker.test_witnesses import IDEAL
 
 Document = dict[str, Any]
 Rng = np.random.Generator
@@ -35,22 +33,7 @@ BY_GAINS: dict[str, Loop] = {
     "a delay": steady(1, times=IDEAL._replace(delay=fmpq(1, 20))),
     "tests": steady(1, times=_TESTS),
 }
-
-
-def pushed(times: Times = IDEAL) -> Loop:
-    """Return ẋ = −x + 0.02 x_c + d, |d| ≤ 1: nearly all that moves e_s is d. An event needs |e_s| > 0.5."""
-    loop, one = steady(0, disturbance=1.0, times=times), identity(1)
-    return loop._replace(
-        A=-1 * one, model_A=-1 * one, gain=number(0.01) * one, rule=loop.rule._replace(floor=number(0.5))
-    )
-
-
-BY_DRIFT: dict[str, Loop] = {
-    "a drift": pushed(),
-    "a drift with noise": pushed()._replace(noise=NOISE),
-    "a first event": pushed(IDEAL._replace(start=fmpq(1, 10))),
-}
-BASES = BY_GAINS | BY_DRIFT
+BASES = BY_GAINS | DRIFTING
 
 
 @functools.cache
@@ -58,9 +41,8 @@ def base(name: str) -> Document:
     """Return a document that is accepted: by gains alone, or by the bound of a drift alone."""
     if name in BY_GAINS:
         return dict(witness_by_gains(BY_GAINS[name], ("x",)).document)
-    document = dict(find_witness(BY_DRIFT[name], ("x",)).document)
-    del document["gains"]
-    return document
+    document = proved(name.replace(" ", "_")).document
+    return {key: value for key, value in document.items() if key != "gains"}
 
 
 @functools.cache
@@ -106,7 +88,7 @@ TIMES: dict[str, Callable[[Document, Rng], object]] = {
 }
 OF_GAINS, OF_DRIFT = (
     [change for each in changes.values() for change in (*TIMES.values(), each)]
-    for changes in (CHANGES, DOCUMENTS)
+    for changes in (GAINS, DOCUMENTS)
 )
 
 
@@ -115,8 +97,8 @@ OF_GAINS, OF_DRIFT = (
     [
         ("two losses", 10),
         ("a first event", 12),
-        *(pytest.param(name, 24, marks=pytest.mark.system) for name in BY_GAINS),
-        *(pytest.param(name, 60, marks=pytest.mark.system) for name in BY_DRIFT),
+        *(pytest.param(name, 24, marks=pytest.mark.deep) for name in BY_GAINS),
+        *(pytest.param(name, 60, marks=pytest.mark.deep) for name in DRIFTING),
     ],
 )
 def test_changed_documents_prove_no_time_that_is_too_long(name: str, count: int) -> None:
@@ -152,7 +134,7 @@ def changed_loops(name: str) -> Iterator[Loop]:
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=() if name == "a drift" else pytest.mark.system) for name in BASES],
+    [pytest.param(name, marks=() if name == "a drift" else pytest.mark.deep) for name in BASES],
 )
 def test_changed_loops_have_no_time_that_is_too_long(name: str) -> None:
     proven = rejected = 0

@@ -5,11 +5,9 @@ import pytest
 from flint import arb, fmpq
 
 from noack.theory.witnesses.assumptions import first_event_s, inter_event_s
-from noack.theory.witnesses.documents import Witness, find_witness
-from noack_check.balls import identity, matrix, number, zeros
+from noack_check.balls import matrix, number, zeros
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
-from noack_check.loop import Loop
 from noack_check.model import Chain, Errors, Model
 from noack_check.norms import growth
 from noack_check.proof import (
@@ -23,24 +21,19 @@ from noack_check.proof import (
 )
 from noack_check.scenario import read_loop
 from tests.checker.completed import completed
+from tests.checker.loops import IDEAL, NOISY, SCHEDULE, double_integrator, early, noisy
+from tests.checker.proofs import Proved, proved
+from tests.checker.rejections import failing, rejects
 from tests.checker.runs import exceeded, floats
-from tests.checker.test_false_witnesses import early, failing, rejects
-from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
 from tests.helpers.resolved_tables import resolved_tables
 
 SIZE = 0.003
-
-
-def noisy(loop: Loop, size: float = SIZE) -> Loop:
-    return loop._replace(noise=identity(loop.n) * number(size))
-
-
-LOOP = noisy(double_integrator(floor=0.03))
+LOOP = NOISY
 
 
 @pytest.fixture(scope="module")
-def witness() -> Witness:
-    return find_witness(LOOP)
+def witness() -> Proved:
+    return proved("noisy")
 
 
 def drift_of(proof: Proof) -> tuple[float, float]:
@@ -109,8 +102,8 @@ def test_a_rule_that_was_silent_says_nothing_with_the_noise_of_the_next_test() -
         assert sum(name.startswith("m/") for name, _ in scalars) == 2 + 2  # guards of two units, two sizes
 
 
-def test_all_tests_fail_with_more_noise(witness: Witness) -> None:
-    entry = next(e for e in witness.document["bounds"] if e["output"] == "x")  # type: ignore[attr-defined]
+def test_all_tests_fail_with_more_noise(witness: Proved) -> None:
+    entry = next(e for e in witness.document["bounds"] if e["output"] == "x")
     assert not failing(LOOP, entry, 0.3)
     found = failing(noisy(LOOP, 4 * SIZE), entry, 0.3)
     for kind in ("0 lost, silent/1 0", "1 lost, silent/1 0", "0 lost, sent/1 0", "0 lost, lost/1 0"):
@@ -119,17 +112,14 @@ def test_all_tests_fail_with_more_noise(witness: Witness) -> None:
 
 
 def test_a_document_without_noise_proves_nothing_with_noise() -> None:
-    loop = double_integrator(floor=0.03)
-    document = completed(noisy(loop), find_witness(loop).document)
-    rejects(noisy(loop), document, "^x: edge/0 lost, sent/")
+    loop = noisy(proved("without_noise").loop)
+    document = completed(loop, proved("without_noise").document)
+    rejects(loop, document, "^x: edge/0 lost, sent/")
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_noise_of_one_state_needs_its_multiplier(witness: Witness, index: int) -> None:
-    one = LOOP._replace(noise=matrix([[SIZE * (index == 0)], [SIZE * (index == 1)]]))
-    document = find_witness(one).document
-    rejects(LOOP, completed(LOOP, document), "^x: edge/0 lost, sent/")
-    prove(one, document)
+def test_noise_of_one_state_needs_its_multiplier(index: int) -> None:
+    rejects(LOOP, completed(LOOP, proved(f"noisy_{index}").document), "^x: edge/0 lost, sent/")
 
 
 def test_the_error_at_the_start_is_any_noise() -> None:
@@ -144,13 +134,9 @@ def test_the_error_at_the_start_is_any_noise() -> None:
 
 def test_the_sensor_error_between_tests_has_the_noise() -> None:
     """e_s is up to threshold + noise after a silent test; runs of an undamped error reach more than f."""
-    loop = double_integrator(floor=0.05, level=0.0)._replace(
-        pushes=matrix([[0.0], [1.0]]), sizes=(arb(0.05),)
-    )
-    loop = noisy(loop, 0.01)._replace(losses=0)
-    proof = find_witness(loop).proof
+    loop, proof = proved("undamped_noisy").loop, proved("undamped_noisy").proof
     sensor = next(bound for bound in proof.bounds if bound.output == "e_s")
-    quiet = find_witness(loop._replace(noise=zeros(2, 0))).proof
+    quiet = proved("undamped").proof
     without = next(bound for bound in quiet.bounds if bound.output == "e_s")
     too_small = proof._replace(bounds=(without,), inter_event=None, first_event=None)
     assert sensor.constant > without.constant + number(0.014)
@@ -158,11 +144,10 @@ def test_the_sensor_error_between_tests_has_the_noise() -> None:
     assert not any(exceeded(loop, proof, np.random.default_rng(k), 30.0) for k in range(3))
 
 
-def test_the_time_between_events_is_shorter_by_the_noise_of_two_measurements(witness: Witness) -> None:
+def test_the_time_between_events_is_shorter_by_the_noise_of_two_measurements(witness: Proved) -> None:
     drift, rate = drift_of(witness.proof), witness.document["rate"]
-    assert isinstance(rate, float)
     without = inter_event_s(LOOP._replace(noise=zeros(2, 0)), rate, drift)
-    assert without > 1.2 * witness.document["inter_event_s"]  # type: ignore[operator]
+    assert without > 1.2 * witness.document["inter_event_s"]
     rejects(LOOP, {**witness.document, "inter_event_s": without}, "^inter_event_s: an event may")
     once = inter_event_s(noisy(LOOP, SIZE / 2), rate, drift)
     rejects(LOOP, {**witness.document, "inter_event_s": once}, "^inter_event_s: an event may")
@@ -171,18 +156,16 @@ def test_the_time_between_events_is_shorter_by_the_noise_of_two_measurements(wit
 def test_without_a_floor_noise_makes_events_at_once() -> None:
     loop = noisy(double_integrator(level=0.05))
     assert inter_event_s(loop, 0.3, (0.1, 0.0)) == 0
-    found = completed(loop, find_witness(double_integrator(level=0.05)).document)
+    found = completed(loop, proved("double_integrator").document)
     rejects(loop, found, "^x: edge/0 lost, sent/")
 
 
 def test_the_first_event_may_come_earlier_by_noise() -> None:
     loop = early(0.05)
     loop = loop._replace(rule=loop.rule._replace(floor=arb(0.03)))
-    found = find_witness(noisy(loop))
-    apart = found.document["inter_event_s"]
-    assert isinstance(apart, float)
-    without = first_event_s(loop, drift_of(found.proof), 2 * apart)
-    assert without > found.document["first_event_s"]  # type: ignore[operator]
+    found = proved("early_noisy")
+    without = first_event_s(loop, drift_of(found.proof), 2 * found.document["inter_event_s"])
+    assert without > found.document["first_event_s"]
     rejects(noisy(loop), {**found.document, "first_event_s": without}, "^first_event_s: an event may")
 
 
@@ -202,10 +185,10 @@ def test_a_start_is_quiet_up_to_the_noise_of_two_measurements() -> None:
 # What is assumed of the errors, and the chain.
 
 
-def test_the_chain_has_the_noise_of_each_missing_event(witness: Witness) -> None:
+def test_the_chain_has_the_noise_of_each_missing_event(witness: Proved) -> None:
     document = {key: value for key, value in witness.document.items() if key != "gains"}
     bounds = {bound.output: bound for bound in prove(LOOP, document).bounds}
-    gain = witness.document["chain"]["gain"]  # type: ignore[index]
+    gain = witness.document["chain"]["gain"]
     constant, size = float(bounds["e_s"].constant.mid()), SIZE * 2**0.5
     recent = float(growth(weighted(LOOP, witness.proof.rate), arb(LOOP.times.delay))[0])
     missing = 2 * gain + recent
@@ -213,7 +196,7 @@ def test_the_chain_has_the_noise_of_each_missing_event(witness: Witness) -> None
     assert float(bounds["e_c"].constant.mid()) == pytest.approx(by_chain)
 
 
-def test_errors_are_assumed_with_the_noise(witness: Witness) -> None:
+def test_errors_are_assumed_with_the_noise(witness: Proved) -> None:
     sensor = {bound.output: bound for bound in witness.proof.bounds}["e_s"]
     sizes = {name: float(getattr(sensor, name).mid()) for name in ("decaying", "constant")}
     most = max(1.0, sizes["decaying"] / sizes["constant"])

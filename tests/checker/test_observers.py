@@ -9,43 +9,25 @@ import pytest
 from flint import arb, fmpq
 from scipy.linalg import expm
 
-from noack.observers.observer_settings import observer_gain
 from noack.theory.witnesses.assumptions import smooth_part
-from noack.theory.witnesses.documents import Witness, find_witness
 from noack_check.balls import matrix, number, zeros
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
-from noack_check.loop import Loop, Noise, Observer, Smooth
+from noack_check.loop import Loop, Noise, Smooth
 from noack_check.model import Model
 from noack_check.noise import noise_of
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
 from tests.checker.completed import completed
+from tests.checker.loops import OBSERVED, OBSERVED_OUTPUT
+from tests.checker.proofs import Proved, proved
+from tests.checker.rejections import rejects
 from tests.checker.runs import exceeded, floats
-from tests.checker.test_false_witnesses import rejects
-from tests.checker.test_witnesses import double_integrator
 from tests.helpers.resolved_tables import resolved_tables
 
 RATE = number(0.3)
-C = np.array([[1.0, 0.0]])
-
-
-def observed(
-    loop: Loop,
-    start: tuple[float, float] = (-0.2, 0.1),
-    noise: float = 0.001,
-    poles: tuple[float, ...] = (-8, -10),
-) -> Loop:
-    """Return a loop whose sensor measures its first state, with noise, and estimates the second one."""
-    A, period_s = floats(loop.model_A), float(loop.times.sampling.p) / float(loop.times.sampling.q)
-    L = observer_gain(expm(A * period_s), C, tuple(np.exp(np.array(poles) * period_s)))
-    estimate = matrix([[value] for value in start])
-    observer = Observer((matrix(L.tolist()),), matrix(C.tolist()), estimate, loop.times.sampling)
-    noise_columns = matrix([[noise]]) if noise else zeros(1, 0)
-    return loop._replace(B=loop.model_B, noise=noise_columns, observer=observer)
-
-
-LOOP = observed(double_integrator(floor=0.03)._replace(losses=1))
+C = OBSERVED_OUTPUT
+LOOP = OBSERVED
 PUSHED = LOOP._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(0.05),), weight=matrix([[2, 0], [1, 1]]))
 
 
@@ -65,8 +47,8 @@ FILTERED = filtered(PUSHED, 1e-6)
 
 
 @pytest.fixture(scope="module")
-def witness() -> Witness:
-    return find_witness(LOOP)
+def witness() -> Proved:
+    return proved("observed")
 
 
 # The bounds of the error.
@@ -135,7 +117,7 @@ def test_errors_stay_within_their_bounds_and_come_near(loop: Loop, part: str) ->
     assert max(shares) > 0.7
 
 
-def test_a_smooth_part_leaves_little(witness: Witness) -> None:
+def test_a_smooth_part_leaves_little(witness: Proved) -> None:
     bounds = [noise_of(LOOP, RATE, smooth) for smooth in (None, smooth_of(LOOP))]
     assert bounds[0].decaying == 2
     assert bounds[1].decaying == 0  # it is added to the constant bounds
@@ -222,7 +204,7 @@ def test_the_smooth_part_flows_and_is_in_the_error_after_an_event() -> None:
         assert together @ after == pytest.approx(together @ z)
 
 
-def test_bounds_are_not_exceeded(witness: Witness) -> None:
+def test_bounds_are_not_exceeded(witness: Proved) -> None:
     for seed in range(6):
         assert exceeded(LOOP, witness.proof, np.random.default_rng(seed), 8.0) == []
 
@@ -230,7 +212,7 @@ def test_bounds_are_not_exceeded(witness: Witness) -> None:
 # Documents and loops.
 
 
-def test_runs_from_another_estimate_exceed_the_bounds(witness: Witness) -> None:
+def test_runs_from_another_estimate_exceed_the_bounds(witness: Proved) -> None:
     assert LOOP.observer is not None
     far = LOOP._replace(observer=LOOP.observer._replace(start=matrix([[-20.0], [10.0]])))
     rejects(far, completed(far, witness.document), "^x: edge/0 lost, sent/")
@@ -255,7 +237,7 @@ CHANGES: dict[str, Callable[[Loop], Loop]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_loop_that_is_none_is_rejected(witness: Witness, change: str) -> None:
+def test_a_loop_that_is_none_is_rejected(witness: Proved, change: str) -> None:
     rejects(CHANGES[change](LOOP), witness.document, "^loop: ")
 
 
@@ -272,9 +254,9 @@ def test_a_loop_that_is_none_is_rejected(witness: Witness, change: str) -> None:
     ],
 )
 def test_a_smooth_part_has_matrices_that_fit(
-    witness: Witness, changes: dict[str, object], reason: str
+    witness: Proved, changes: dict[str, object], reason: str
 ) -> None:
-    document: dict[str, Any] = copy.deepcopy(dict(witness.document))
+    document: dict[str, Any] = copy.deepcopy(witness.document)
     document["observer"] |= changes
     rejects(LOOP, document, reason)
 
@@ -283,19 +265,19 @@ def test_a_smooth_part_has_matrices_that_fit(
     ("value", "reason"),
     [(1, "^observer: not a table"), ([], "^observer: not a table"), ({}, "^columns: not a matrix")],
 )
-def test_a_smooth_part_is_a_table(witness: Witness, value: object, reason: str) -> None:
+def test_a_smooth_part_is_a_table(witness: Proved, value: object, reason: str) -> None:
     rejects(LOOP, {**witness.document, "observer": value}, reason)
 
 
-def test_a_document_without_the_smooth_part_proves_nothing(witness: Witness) -> None:
-    document: dict[str, Any] = copy.deepcopy(dict(witness.document))
+def test_a_document_without_the_smooth_part_proves_nothing(witness: Proved) -> None:
+    document: dict[str, Any] = copy.deepcopy(witness.document)
     prove(LOOP, document)
     del document["observer"]
     rejects(LOOP, document, r"^x: X is not a symmetric \(2, 2\)")
 
 
-def test_another_smooth_part_is_no_proof_by_the_same_forms(witness: Witness) -> None:
-    document: dict[str, Any] = copy.deepcopy(dict(witness.document))
+def test_another_smooth_part_is_no_proof_by_the_same_forms(witness: Proved) -> None:
+    document: dict[str, Any] = copy.deepcopy(witness.document)
     document["observer"]["rates"] = (np.array(document["observer"]["rates"]) * 1.5).tolist()
     rejects(LOOP, document, "^x: flow/0 lost/")
 

@@ -1,7 +1,6 @@
 """Periodic rules: witnesses, false witnesses, and runs."""
 
 import copy
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,49 +9,36 @@ import pytest
 from flint import arb, fmpq
 
 from noack.core.periods import period_of
-from noack.theory.witnesses.documents import NoWitnessError, Witness, find_witness
-from noack_check.balls import matrix, number, zeros
+from noack_check.balls import matrix, number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop, Times
 from noack_check.model import Edge, Model
 from noack_check.proof import prove
 from noack_check.times import Schedule
+from tests.checker.changes import DOCUMENTS, accepted
+from tests.checker.changes import LOOPS as OTHER_LOOPS
 from tests.checker.completed import completed
-from tests.checker.random_loops import random_periodic_loop
+from tests.checker.loops import PERIODIC, SCHEDULE, periodic
+from tests.checker.proofs import Proved, proved
 from tests.checker.runs import exceeded
-from tests.checker.test_mutations import DOCUMENTS
-from tests.checker.test_mutations import LOOPS as OTHER_LOOPS
-from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
+
+EXACT, SHORT = PERIODIC["exact"], PERIODIC["short"]
 
 
-def periodic(least: fmpq, most: fmpq, times: Times = SCHEDULE) -> Loop:
-    """Return a double integrator whose events come periodically."""
-    loop = double_integrator(times)
-    rule = loop.rule._replace(positive=zeros(0, 4), level=arb(0), rate=arb(0), floor=arb(0))
-    return loop._replace(rule=rule, times=loop.times._replace(least_period=least, period=most))
+@pytest.fixture(scope="module", params=PERIODIC)
+def found(request: pytest.FixtureRequest) -> Proved:
+    return proved(f"periodic_{request.param}")
 
 
-EXACT = periodic(fmpq(3, 10), fmpq(3, 10))
-SHORT = periodic(fmpq(3, 200), fmpq(1, 50), SCHEDULE._replace(start=fmpq(1, 100)))._replace(losses=1)
-"""Its updates may be on their way for 20 ms, in which one more event may come."""
-LOOPS = {"exact": EXACT, "short": SHORT}
-
-
-@pytest.fixture(scope="module", params=LOOPS)
-def found(request: pytest.FixtureRequest) -> tuple[Loop, Witness]:
-    loop = LOOPS[request.param]
-    return loop, find_witness(loop, ("x", "e_c"))
-
-
-def test_runs_stay_below_the_bounds(found: tuple[Loop, Witness]) -> None:
-    loop, witness = found
+def test_runs_stay_below_the_bounds(found: Proved) -> None:
+    loop, witness = found.loop, found
     rng = np.random.default_rng(1)
-    for _ in range(6):
+    for _ in range(3):
         assert exceeded(loop, witness.proof, rng, 6.0) == []
 
 
-def test_runs_come_near_the_bounds(found: tuple[Loop, Witness]) -> None:
-    loop, witness = found
+def test_runs_come_near_the_bounds(found: Proved) -> None:
+    loop, witness = found.loop, found
     rng = np.random.default_rng(1)
     shares = {"x": 0.9, "e_c": 0.15}
     bounds = tuple(
@@ -65,16 +51,10 @@ def test_runs_come_near_the_bounds(found: tuple[Loop, Witness]) -> None:
 
 
 def test_updates_may_be_on_their_way_for_more_than_a_period() -> None:
-    assert find_witness(SHORT, ("x",)).document["later"] == 1
+    document = proved("periodic_short").document
+    assert document["later"] == 1
     with pytest.raises(RejectedError, match="later"):
-        prove(SHORT, {**find_witness(SHORT, ("x",)).document, "later": 0})
-
-
-def test_no_bound_decays_faster_than_that_of_a_similar_loop() -> None:
-    rate = find_witness(SHORT, ("x",)).document["rate"]
-    assert isinstance(rate, float)
-    slower = find_witness(SHORT, ("x",), near=[{"rate": 0.9 * rate, "bounds": []}]).document
-    assert slower["rate"] == pytest.approx(rate * 0.02 / 0.3)
+        prove(SHORT, {**document, "later": 0})
 
 
 CHANGES: dict[str, Callable[[Loop], Loop]] = {
@@ -103,15 +83,9 @@ REASONS = {
 }
 
 
-def test_a_loop_is_searched_although_a_similar_one_decays_more_slowly() -> None:
-    """So with the box of a plant: the rates that are tried are those of the box's centre."""
-    near = {"rate": 0.001, "bounds": []}
-    assert find_witness(EXACT, ("x",), near=[near]).document["rate"] == 0.001
-
-
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_witness_proves_nothing_about_another_loop(found: tuple[Loop, Witness], change: str) -> None:
-    loop, witness = found
+def test_a_witness_proves_nothing_about_another_loop(found: Proved, change: str) -> None:
+    loop, witness = found.loop, found
     other = CHANGES[change](loop)
     with pytest.raises(RejectedError, match=f"^x: {REASONS[change]}"):
         prove(other, completed(other, witness.document))
@@ -125,20 +99,18 @@ def test_a_witness_proves_nothing_about_another_loop(found: tuple[Loop, Witness]
         *((pieces, "^pieces: not a whole number") for pieces in (-1, 65, True, 4.0, "4", None)),
     ],
 )
-def test_another_number_of_nodes_is_rejected(
-    found: tuple[Loop, Witness], pieces: object, reason: str
-) -> None:
-    loop, witness = found
+def test_another_number_of_nodes_is_rejected(found: Proved, pieces: object, reason: str) -> None:
+    loop, witness = found.loop, found
     if loop is SHORT and pieces in (1, 2, 3) and pieces is not True:
         pytest.skip("its edges begin and end at the same nodes as with 4")
     with pytest.raises(RejectedError, match=reason):
         prove(loop, {**witness.document, "pieces": pieces})
 
 
-def test_the_sensors_error_and_its_assumed_size_are_rejected(found: tuple[Loop, Witness]) -> None:
+def test_the_sensors_error_and_its_assumed_size_are_rejected(found: Proved) -> None:
     """In the model x_s is not reset by an update that is lost: its error is not that of the sensor."""
-    loop, witness = found
-    document: Any = copy.deepcopy(dict(witness.document))
+    loop, witness = found.loop, found
+    document: Any = copy.deepcopy(witness.document)
     document["bounds"][0]["output"] = "e_s"
     with pytest.raises(RejectedError, match="e_s"):
         prove(loop, document)
@@ -147,10 +119,10 @@ def test_the_sensors_error_and_its_assumed_size_are_rejected(found: tuple[Loop, 
         prove(loop, {**witness.document, "chain": chain, "errors": {"decaying": 1.0, "constant": 0.0}})
 
 
-def test_a_form_at_another_node_is_rejected(found: tuple[Loop, Witness]) -> None:
+def test_a_form_at_another_node_is_rejected(found: Proved) -> None:
     """As if an event came at another time."""
-    loop, witness = found
-    document: Any = copy.deepcopy(dict(witness.document))
+    loop, witness = found.loop, found
+    document: Any = copy.deepcopy(witness.document)
     forms = document["bounds"][0]["matrices"]
     last = max(int(name.rpartition(" ")[2]) for name in forms if name.startswith("P/0 lost"))
     forms[f"P/0 lost, {last}"] = forms[f"P/0 lost, {last - 1}"]
@@ -240,63 +212,25 @@ def test_wrong_periods_are_rejected(name: str) -> None:
         prove(EXACT._replace(times=WRONG[name]), document)
 
 
-# Random loops.
-
-
-def _found_for(seed: int) -> bool:
-    """Return whether there is a witness, after runs of the loop."""
-    rng = np.random.default_rng(seed)
-    loop = random_periodic_loop(rng)
-    try:
-        proof = find_witness(loop, ("x",) if seed % 2 else ("e_c",)).proof
-    except NoWitnessError:
-        return False
-    period = float(loop.times.period.p) / float(loop.times.period.q)
-    for _ in range(6):
-        assert exceeded(loop, proof, rng, 40 * period) == []
-    return True
-
-
-def test_bounds_of_a_few_random_loops_are_not_exceeded() -> None:
-    found = [_found_for(seed) for seed in (11, 14)]  # with one state: fast
-    assert any(found)
-
-
-@pytest.mark.system
-@pytest.mark.timeout(2400)
-def test_bounds_of_random_loops_are_not_exceeded() -> None:
-    seeds = range(30)
-    assert sum(_found_for(seed) for seed in seeds) >= len(seeds) // 2
-
-
 def test_ideal_conditions_have_a_witness() -> None:
-    loop = periodic(fmpq(1, 2), fmpq(1, 2), IDEAL)
-    proof = find_witness(loop, ("x",)).proof
+    proof = proved("periodic_ideal").proof
     (bound,) = proof.bounds
     assert 1.0 <= float(bound.decaying.mid()) < 1.5
     assert proof.rate > 0
 
 
-@functools.cache
-def base(name: str) -> tuple[Loop, dict[str, Any]]:
-    loop = LOOPS[name]
-    return loop, dict(find_witness(loop, ("x", "e_c")).document)
-
-
-@pytest.mark.system
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.deep
+@pytest.mark.parametrize("name", PERIODIC)
 @pytest.mark.parametrize("change", [*DOCUMENTS, *OTHER_LOOPS])
 def test_what_is_accepted_of_changed_witnesses_is_true(name: str, change: str) -> None:
     """Random runs stay within what was accepted."""
-    loop, document = base(name)
+    loop, document = PERIODIC[name], proved(f"periodic_{name}").document
     for seed in range(3):
         rng, other = np.random.default_rng(seed), copy.deepcopy(document)
         changed = OTHER_LOOPS[change](loop, rng) if change in OTHER_LOOPS else loop
         if change in DOCUMENTS:
             DOCUMENTS[change](other, rng)
-        try:
-            proof = prove(changed, other)
-        except RejectedError:
+        if (proof := accepted(changed, other)) is None:
             continue
         for _ in range(3):
             assert exceeded(changed, proof, rng, 6.0) == []

@@ -1,51 +1,40 @@
 """What a witness proves of random loops is never exceeded in runs of them."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
+from flint import arb
 
 from noack.theory.witnesses.documents import find_witness
 from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.balls import number
 from noack_check.loop import Loop
-from tests.checker.random_loops import random_loop, random_loop_with_long_delays, random_noisy_loop
+from noack_check.proof import Proof
+from tests.checker.proofs import RANDOM, proved
+from tests.checker.random_loops import random_loop
 from tests.checker.runs import exceeded
-from tests.checker.test_witnesses import double_integrator
 
 _RUNS = 6
+_TESTS, _PERIODS = 600, 40
+"""So long is a run."""
 
 
-def _found_for(
-    seed: int, draw: Callable[[np.random.Generator], Loop] = random_loop, runs: int = _RUNS
-) -> bool:
-    """Return whether there is a witness, after runs of the loop."""
-    rng = np.random.default_rng(seed)
-    loop = draw(rng)
-    try:
-        proof = find_witness(loop).proof
-    except NoWitnessError:
-        return False
-    until = 600 * float(loop.times.sampling.p) / float(loop.times.sampling.q)
+def require_not_exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, runs: int) -> None:
+    times = loop.times
+    until = _PERIODS * times.period if times.period > 0 else _TESTS * times.sampling
     for _ in range(runs):
-        assert exceeded(loop, proof, rng, until) == []
-    return True
+        assert exceeded(loop, proof, rng, float(arb(until))) == []
 
 
-def test_bounds_of_a_few_random_loops_are_not_exceeded() -> None:
-    found = [_found_for(seed) for seed in (105, 108)]  # with one state: fast
-    assert any(found)
-
-
-def test_bounds_with_long_delays_and_events_before_the_first_input_are_not_exceeded() -> None:
-    assert _found_for(9, random_loop_with_long_delays, 2)  # a relative rule, one later event
+@pytest.mark.parametrize(("kind", "seed"), [(kind, seed) for kind, seed, _ in RANDOM])
+def test_bounds_of_a_few_random_loops_are_not_exceeded(kind: str, seed: int) -> None:
+    found = proved(f"random_{kind.replace(' ', '_')}_{seed}")
+    require_not_exceeded(found.loop, found.proof, np.random.default_rng(seed), 2)
 
 
 def test_runs_come_near_the_bounds() -> None:
     """Runs that could not exceed a bound that is too small would show nothing."""
     rng = np.random.default_rng(1)
-    loop = double_integrator()
-    proof = find_witness(loop).proof
+    loop, proof = proved("double_integrator").loop, proved("double_integrator").proof
     smaller = [
         bound._replace(decaying=bound.decaying * share)
         for bound in proof.bounds
@@ -56,21 +45,27 @@ def test_runs_come_near_the_bounds() -> None:
     assert found >= {"x", "e_s", "e_c", "drift"}
 
 
-@pytest.mark.system
-@pytest.mark.timeout(1200)
-def test_bounds_of_random_loops_are_not_exceeded() -> None:
-    seeds = range(100, 125)
-    assert sum(_found_for(seed) for seed in seeds) >= len(seeds) // 4
-
-
-@pytest.mark.system
-@pytest.mark.timeout(1200)
-def test_bounds_of_random_loops_with_noise_are_not_exceeded() -> None:
-    assert sum(_found_for(seed, random_noisy_loop) for seed in range(12)) >= 1
-
-
-@pytest.mark.system
-@pytest.mark.timeout(1200)
-def test_bounds_of_random_loops_with_long_delays_are_not_exceeded() -> None:
-    seeds = range(12)
-    assert sum(_found_for(seed, random_loop_with_long_delays) for seed in seeds) >= len(seeds) // 2
+@pytest.mark.deep
+@pytest.mark.timeout(2400)
+@pytest.mark.parametrize(
+    ("kind", "seeds", "least"),
+    [
+        ("threshold", range(100, 125), 6),
+        ("noisy", range(12), 1),
+        ("long delays", range(12), 6),
+        ("periodic", range(30), 15),
+    ],
+)
+def test_bounds_of_random_loops_are_not_exceeded(kind: str, seeds: range, least: int) -> None:
+    found = 0
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        loop = random_loop(rng, kind)
+        outputs = ("x", "e_c") if kind != "periodic" else ("x",) if seed % 2 else ("e_c",)
+        try:
+            proof = find_witness(loop, outputs).proof
+        except NoWitnessError:
+            continue
+        found += 1
+        require_not_exceeded(loop, proof, rng, _RUNS)
+    assert found >= least

@@ -8,19 +8,24 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
-from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
+from cosim.analysis.witnesses import resolved_content
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.witnesses.documents import witness_by_gains
 from noack.theory.witnesses.gains import find_by_gains
+from noack.theory.witnesses.outward import proven_bounds
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
 from tests.checker.completed import completed
+from tests.checker.proofs import Proved, proved
 from tests.checker.runs import floats
+from tests.helpers.bound_shares import share_of_bound
 from tests.helpers.shipped import resolved, shipped
 
 SERVO = "servo_reference"
@@ -35,10 +40,8 @@ def loop_with(tables: dict[str, Any], *, box: bool = True, **times: fmpq) -> Loo
 
 
 @pytest.fixture(scope="module")
-def statement() -> WitnessedStatement:
-    found = find_statement(resolved(SERVO), "box", "schedule")
-    assert found.proof is not None, found.reason
-    return found
+def statement() -> Proved:
+    return proved("servo_reference")
 
 
 def changed(key: str, row: int, column: int, factor: float, segment: int = 4) -> dict[str, Any]:
@@ -86,26 +89,27 @@ def test_the_input_is_not_u_r_before_the_first_one_acts() -> None:
     assert floats(loop.start)[:, 0] == pytest.approx([0.0, 0.0], abs=1e-12)
 
 
-def test_the_angle_has_a_proven_bound(statement: WitnessedStatement) -> None:
-    assert statement.bounds is not None
+def test_the_angle_has_a_proven_bound(statement: Proved) -> None:
     assert statement.bounds.bounds["y[0]"].constant < 0.03
     assert not statement.bounds.limits  # nothing is known after the end of the reference
 
 
-def test_no_simulated_run_exceeds_it(statement: WitnessedStatement) -> None:
+def share_of_distance(chosen: Scenario, bounds: ProvenBounds) -> float:
+    """Return the largest share of the bound that the angle's distance from its reference uses in a run."""
+    reference = loop_of(chosen).reference
+    assert reference is not None
+    rows = simulate(chosen)[PLANT_STEP]
+    t_ns = np.asarray(rows["t_ns"])
+    return share_of_bound(bounds, "y[0]", t_ns, (rows["x"] - reference.states(t_ns))[:, 0])
+
+
+def test_no_simulated_run_exceeds_it(statement: Proved) -> None:
     """The runs are those of noack's machines, with the true plant at an end of its range."""
-    assert statement.bounds is not None
-    bound, rate, largest = statement.bounds.bounds["y[0]"], statement.bounds.rate_per_s, 0.0
+    largest = 0.0
     for loss, gain in product((0.0, 0.5, 1.0), (3.8, 4.2)):
         settings = ("plant.draw=given", "plant.A=[[0.0,1.0],[0.0,-2.0]]", f"plant.B=[[0.0],[{gain}]]")
         chosen = resolve(shipped(SERVO, *settings, f"network.loss.probability={loss}"))
-        reference = loop_of(chosen).reference
-        assert reference is not None
-        rows = simulate(chosen)[PLANT_STEP]
-        t_ns = np.asarray(rows["t_ns"])
-        distance = np.abs((rows["x"] - reference.states(t_ns))[:, 0])
-        limit = bound.decaying * np.exp(-rate * t_ns * 1e-9) + bound.constant
-        largest = max(largest, float((distance / limit).max()))
+        largest = max(largest, share_of_distance(chosen, statement.bounds))
     assert 0.3 < largest <= 1.0
 
 
@@ -117,9 +121,8 @@ def test_no_simulated_run_exceeds_it(statement: WitnessedStatement) -> None:
     ],
 )
 def test_the_bound_is_none_of_another_reference(
-    statement: WitnessedStatement, key: str, row: int, column: int, factor: float
+    statement: Proved, key: str, row: int, column: int, factor: float
 ) -> None:
-    assert statement.document is not None
     loop = loop_with(changed(key, row, column, factor))
     with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
         prove(loop, completed(loop, statement.document))
@@ -142,8 +145,7 @@ def test_a_jump_ends_the_statement_before_it() -> None:
         ),
     ],
 )
-def test_the_bound_is_none_of_a_worse_loop(statement: WitnessedStatement, setting: str, reason: str) -> None:
-    assert statement.document is not None
+def test_the_bound_is_none_of_a_worse_loop(statement: Proved, setting: str, reason: str) -> None:
     loop = loop_with(servo(setting))
     with pytest.raises(RejectedError, match=f"^x: {reason}"):
         prove(loop, completed(loop, statement.document))
@@ -155,16 +157,14 @@ def test_an_older_input_differs_by_more() -> None:
     assert np.abs(long[:, 0]) == pytest.approx(4 * np.abs(short[:, 0]), rel=1e-6)
 
 
-def test_a_bound_in_the_limit_is_rejected(statement: WitnessedStatement) -> None:
-    assert statement.document is not None
+def test_a_bound_in_the_limit_is_rejected(statement: Proved) -> None:
     document = copy.deepcopy(statement.document)
-    document["bounds"][0]["from_start"] = False  # type: ignore[index]
+    document["bounds"][0]["from_start"] = False
     with pytest.raises(RejectedError, match="no bound in the limit"):
         prove(loop_with(servo()), document)
 
 
-def test_the_offset_of_joined_pieces_is_added(statement: WitnessedStatement) -> None:
-    assert statement.document is not None
+def test_the_offset_of_joined_pieces_is_added(statement: Proved) -> None:
     loop = loop_with(servo())
     near, far = (prove(loop._replace(offset=arb(size)), statement.document) for size in (0.0, 0.25))
     constants = [
@@ -207,16 +207,10 @@ def test_a_loop_with_an_observer_is_about_its_reference() -> None:
     observed = ("plant.measurement.C=[[1.0,0.0]]", 'observer={kind="luenberger",poles_per_s=[-12.0,-15.0]}')
     settings = (*observed, "plant.draw=given", "plant.A=[[0.0,1.0],[0.0,-2.0]]", "plant.B=[[0.0],[4.0]]")
     loop = read_loop(servo(*settings), box=False, ideal=False)
-    proof = witness_by_gains(loop, ("x", "y[0]")).proof
-    bound, largest = next(bound for bound in proof.bounds if bound.output == "y[0]"), 0.0
+    bounds, largest = proven_bounds(witness_by_gains(loop, ("x", "y[0]")).proof, loop), 0.0
     for seed in range(2):
         chosen = resolve(shipped(SERVO, *settings, "network.loss.probability=1.0", f"seeds.loss={seed}"))
-        reference = loop_of(chosen).reference
-        assert reference is not None
-        rows = simulate(chosen)[PLANT_STEP]
-        t_ns = np.asarray(rows["t_ns"])
-        limit = float(bound.decaying) * np.exp(-float(proof.rate) * t_ns * 1e-9) + float(bound.constant)
-        largest = max(largest, float((np.abs((rows["x"] - reference.states(t_ns))[:, 0]) / limit).max()))
+        largest = max(largest, share_of_distance(chosen, bounds))
     assert 0.05 < largest <= 1.0
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from flint import arb, fmpq
+from flint import fmpq
 
 from cosim.analysis.certificates import Certificates
 from noack.core.progress import no_progress
@@ -21,7 +21,8 @@ from noack.theory.witnesses.templates import Templates
 from noack_check.balls import matrix, number
 from noack_check.model import Model
 from noack_check.proof import read_assumptions
-from tests.checker.test_witnesses import IDEAL, bounds_of, double_integrator
+from tests.checker.loops import bounds_of, double_integrator, pushed
+from tests.checker.proofs import proved
 from tests.helpers.shipped import resolved
 
 
@@ -56,7 +57,7 @@ def test_a_loop_that_starts_at_rest_is_bounded() -> None:
 def test_states_of_any_size_have_bounds_without_a_warning(size: float) -> None:
     """Squares of them overflow in the search."""
     loop = double_integrator(level=0.05 * size)._replace(start=matrix([[size], [0.0]]))
-    assert 1 < bounds_of(find_witness(loop))["x"] / size < 20
+    assert 1 < bounds_of(find_witness(loop).proof)["x"] / size < 20
 
 
 def test_without_a_finite_value_the_search_ends() -> None:
@@ -97,8 +98,8 @@ def test_templates_are_the_inequalities_of_the_model(decay: float) -> None:
 
 def test_the_rate_of_a_similar_loop_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """With ν from ideal conditions each output needs one problem, and its bound is nearly as small."""
-    ideal, loop = find_witness(double_integrator(IDEAL)).document, double_integrator()
-    alone, solved = bounds_of(find_witness(loop)), []
+    ideal, alone = proved("ideal").document, proved("double_integrator")
+    solved = []
     solve = semidefinite._Problem.solve
 
     def counted(*arguments: object) -> semidefinite.SolverAnswer:
@@ -106,9 +107,9 @@ def test_the_rate_of_a_similar_loop_needs_no_search(monkeypatch: pytest.MonkeyPa
         return solve(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(semidefinite._Problem, "solve", counted)
-    helped = bounds_of(find_witness(loop, near=[ideal]))
+    helped = bounds_of(find_witness(alone.loop, near=[ideal]).proof)
     assert len(solved) <= 5
-    for output, bound in alone.items():
+    for output, bound in bounds_of(alone.proof).items():
         assert helped[output] < 1.03 * bound
 
 
@@ -119,17 +120,30 @@ def test_a_rate_of_a_similar_loop_with_which_nothing_is_found_is_left() -> None:
     for rate, decay in ((0.3, 1e6), (0.3, 1.2534), (0.1, 0.8)):
         bound = {"output": "drift", "from_start": True, "decay": decay}
         near = {"rate": rate, "bounds": [bound]}
-        assert bounds_of(find_witness(loop, (), near=[near])) == bounds_of(alone)
+        assert bounds_of(find_witness(loop, (), near=[near]).proof) == bounds_of(alone.proof)
     by_gains = {"rate": 0.3, "gains": {}}
-    assert bounds_of(find_witness(loop, (), near=[by_gains])) == bounds_of(alone)
+    assert bounds_of(find_witness(loop, (), near=[by_gains]).proof) == bounds_of(alone.proof)
     rough = [rough_bounds(loop, ["x"], near, Effort(no_progress)).sizes for near in ([], [by_gains])]
     assert rough[0] == rough[1]
+
+
+def test_no_bound_of_a_periodic_rule_decays_faster_than_that_of_a_similar_loop() -> None:
+    loop, rate = proved("random_periodic_11").loop, proved("random_periodic_11").document["rate"]
+    slower = find_witness(loop, ("x",), near=[{"rate": 0.9 * rate, "bounds": []}]).document
+    assert slower["rate"] == pytest.approx(rate * 0.02 / 0.3)
+
+
+def test_a_loop_is_searched_although_a_similar_one_decays_more_slowly() -> None:
+    """So with the box of a plant: the rates that are tried are those of the box's centre."""
+    near = {"rate": 0.001, "bounds": []}
+    loop = proved("random_periodic_11").loop
+    assert find_witness(loop, ("x",), near=[near]).document["rate"] == 0.001
 
 
 def test_a_small_rate_is_tried_where_larger_ones_have_no_forms() -> None:
     found = find_witness(double_integrator()._replace(half_B=matrix([[0.0], [0.3]])), ("x",))
     assert "bounds" in found.document
-    assert bounds_of(found)["x"] < 4
+    assert bounds_of(found.proof)["x"] < 4
 
 
 def test_a_search_without_forms_says_which_inequality_fails_first_and_by_how_much() -> None:
@@ -162,6 +176,12 @@ def test_inequalities_that_have_a_solution_are_not_missed() -> None:
     assert impossible.name.startswith("flow/")
 
 
+def test_a_loop_that_does_not_decay_has_no_witness() -> None:
+    loop = double_integrator()
+    with pytest.raises(NoWitnessError, match="does not decay"):
+        find_witness(loop._replace(gain=loop.gain * -1))
+
+
 def test_progress_rises_to_its_end() -> None:
     shares: list[float] = []
     find_witness(double_integrator(), progress=shares.append)
@@ -186,7 +206,7 @@ def test_a_search_ends_at_its_limit_of_work() -> None:
 
 def test_a_disturbance_shortens_the_time_between_events_as_little_as_possible() -> None:
     """Both parts of the drift's bound count in units of their thresholds, 0.05 and 0.0005."""
-    loop = double_integrator(floor=0.0005)._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(0.0005),))
+    loop = pushed(double_integrator(floor=0.0005), 0.0005)
     apart = find_witness(loop, ("x",)).proof.inter_event
     assert apart is not None
     assert float(apart) > 0.02
@@ -194,7 +214,7 @@ def test_a_disturbance_shortens_the_time_between_events_as_little_as_possible() 
 
 def test_both_parts_of_a_bound_of_the_controllers_error_are_some_thresholds() -> None:
     """Of 0.05 and 0.0005. In one unit the second part counts for nothing, and is 31 of its thresholds."""
-    loop = double_integrator(floor=0.0005)._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(0.0005),))
+    loop = pushed(double_integrator(floor=0.0005), 0.0005)
     by_forms = next(bound for bound in find_witness(loop, ("e_c",)).proof.bounds if bound.output == "e_c")
     assert by_forms.decaying < 10 * 0.05
     assert by_forms.constant < 10 * 0.0005

@@ -1,8 +1,6 @@
 """Rules whose tests are an exact time apart: dwell times, dynamic variables, grids; false witnesses, runs."""
 
 import copy
-import functools
-import json
 from collections.abc import Callable
 from typing import Any
 
@@ -10,84 +8,45 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
-from noack.theory.witnesses.documents import Witness, find_witness
 from noack_check.balls import beside, identity, matrix, number, zeros
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop, Times
 from noack_check.model import Model
 from noack_check.proof import prove
-from noack_check.scenario import read_loop
 from noack_check.tests_apart import Place, Places
+from tests.checker.changes import DOCUMENTS, accepted
+from tests.checker.changes import LOOPS as OTHER_LOOPS
 from tests.checker.completed import completed
+from tests.checker.loops import (
+    DYNAMIC_RULE,
+    IDEAL,
+    SCHEDULE,
+    TESTED_APART,
+    double_integrator,
+    dwelling,
+    dynamic,
+    held,
+    of_scenario,
+    trigger_setting,
+)
+from tests.checker.proofs import Proved, proved
 from tests.checker.runs import exceeded, floats
-from tests.checker.test_mutations import DOCUMENTS
-from tests.checker.test_mutations import LOOPS as OTHER_LOOPS
-from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
-from tests.helpers.resolved_tables import resolved_tables
 
 T = fmpq(1, 100)
-DYNAMIC = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5, "eta_0": 0.1}
+NAMES = list(TESTED_APART)
 
 
-def toml(trigger: dict[str, Any]) -> str:
-    """Return the setting of a trigger."""
-    text = json.dumps(trigger).replace('": ', '" = ')
-    return f"trigger={text}"
-
-
-def read(name: str, trigger: dict[str, Any] | None = None, *settings: str, ideal: bool = False) -> Loop:
-    given = [] if trigger is None else [toml(trigger)]
-    return read_loop(resolved_tables(name, *given, *settings), box=False, ideal=ideal)
-
-
-def dwelling(times: Times = SCHEDULE) -> Loop:
-    """Return a double integrator that waits for five tests after an event."""
-    loop = double_integrator(times, floor=0.02)
-    return loop._replace(times=loop.times._replace(dwell=5 * loop.times.sampling), losses=1)
-
-
-def dynamic() -> Loop:
-    """Return a loop with Girard's rule, without losses and delays, tested every 20 ms."""
-    loop, zero = read("double_integrator", DYNAMIC, "network.mansd=0"), fmpq(0)
-    step = fmpq(1, 50)
-    return loop._replace(
-        times=loop.times._replace(delay=zero, age=zero, start=zero, sampling=step, least_sampling=step)
-    )
-
-
-def held() -> Loop:
-    """Return Tabuada's example under Girard's rule, with its input held, tested every 6 ms, a test late."""
-    step = fmpq(6, 1000)
-    times = Times(step, step, step, fmpq(0), step)
-    return read("tabuada_dynamic")._replace(times=times)
-
-
-LOOPS: dict[str, Callable[[], Loop]] = {
-    "held": held,
-    "dwell": lambda: dwelling()._replace(losses=0),
-    "dwell, a loss": dwelling,
-    "dynamic": dynamic,
-    "switching": lambda: read("selivanov_switching"),
-    "grid": lambda: read("reactor_petc", ideal=True),
-}
-
-
-NAMES = [pytest.param(name, marks=pytest.mark.system if "loss" in name else ()) for name in LOOPS]
-"""The search of the one with a loss takes long."""
-
-
-@functools.cache
-def base(name: str) -> tuple[Loop, Witness]:
-    loop = LOOPS[name]()
-    return loop, find_witness(loop, ("x", "e_c"))
+def base(name: str) -> tuple[Loop, Proved]:
+    found = proved(f"tests_{name}")
+    return found.loop, found
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_runs_stay_below_the_bounds(name: str) -> None:
     loop, witness = base(name)
     rng = np.random.default_rng(1)
-    for _ in range(4):
+    for _ in range(2):
         assert exceeded(loop, witness.proof, rng, 4.0) == []
 
 
@@ -265,7 +224,7 @@ def test_a_longer_dwell_time_and_another_memory_are_rejected() -> None:
 def test_a_negative_coefficient_of_the_memory_is_rejected() -> None:
     """η is bounded from above only, so V may not fall with it."""
     loop, witness = base("dynamic")
-    document: Any = copy.deepcopy(dict(witness.document))
+    document: Any = copy.deepcopy(witness.document)
     numbers = document["bounds"][0]["numbers"]
     for name in numbers:
         if name.startswith("eta/"):
@@ -276,7 +235,7 @@ def test_a_negative_coefficient_of_the_memory_is_rejected() -> None:
 
 def test_the_error_has_no_bound_where_the_model_has_only_its_input() -> None:
     loop, witness = base("switching")
-    document: Any = copy.deepcopy(dict(witness.document))
+    document: Any = copy.deepcopy(witness.document)
     document["bounds"][0]["output"] = "e_s"
     with pytest.raises(RejectedError, match="e_s"):
         prove(loop, document)
@@ -294,7 +253,7 @@ def test_a_witness_counts_as_many_tests_as_it_has_forms_for() -> None:
 
 def test_the_drift_bounds_no_error_during_a_dwell_time() -> None:
     loop, witness = base("dwell")
-    document: Any = copy.deepcopy(dict(witness.document))
+    document: Any = copy.deepcopy(witness.document)
     document["bounds"][0]["output"] = "drift"
     with pytest.raises(RejectedError, match=r"^drift: output/0 lost/"):
         prove(loop, document)
@@ -359,22 +318,20 @@ OF_LOOPS = OTHER_LOOPS | {
 }
 
 
-@pytest.mark.system
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.deep
+@pytest.mark.parametrize("name", TESTED_APART)
 @pytest.mark.parametrize("change", [*DOCUMENTS, *OF_LOOPS])
 def test_what_is_accepted_of_changed_witnesses_is_true(name: str, change: str) -> None:
     """Random runs stay within what was accepted."""
     loop, witness = base(name)
     for seed in range(2):
-        rng, document = np.random.default_rng(seed), copy.deepcopy(dict(witness.document))
+        rng, document = np.random.default_rng(seed), copy.deepcopy(witness.document)
         changed = OF_LOOPS[change](loop, rng) if change in OF_LOOPS else loop
         if change in DOCUMENTS:
-            if change == "outputs swapped" and len(document["bounds"]) < 2:  # type: ignore[arg-type]
+            if change == "outputs swapped" and len(document["bounds"]) < 2:
                 continue
             DOCUMENTS[change](document, rng)
-        try:
-            proof = prove(changed, document)
-        except RejectedError:
+        if (proof := accepted(changed, document)) is None:
             continue
         for _ in range(2):
             assert exceeded(changed, proof, rng, 3.0) == []
@@ -408,7 +365,7 @@ DUE = {
 @pytest.mark.parametrize("name", DUE)
 def test_rules_whose_events_do_not_depend_on_a_comparison(name: str) -> None:
     trigger, least, most = DUE[name]
-    loop = read("double_integrator", trigger)
+    loop = of_scenario("double_integrator", trigger_setting(trigger))
     assert (loop.times.least_period, loop.times.period) == (least, most)
     assert loop.rule.positive.nrows() == 0
     assert loop.fault() == ""
@@ -417,7 +374,7 @@ def test_rules_whose_events_do_not_depend_on_a_comparison(name: str) -> None:
 @pytest.mark.parametrize(
     ("trigger", "ideal", "key"),
     [
-        (DYNAMIC, True, "trigger.policy"),
+        (DYNAMIC_RULE, True, "trigger.policy"),
         (
             {"policy": "dwell", "interval_s": 0.1, "rule": {"policy": "send_on_area", "delta_s": 0.1}},
             False,
@@ -428,7 +385,7 @@ def test_rules_whose_events_do_not_depend_on_a_comparison(name: str) -> None:
 )
 def test_what_needs_tests_at_times_is_refused_without(trigger: dict[str, Any], ideal: bool, key: str) -> None:
     with pytest.raises(RefusedError, match=key):
-        read("double_integrator", trigger, ideal=ideal)
+        of_scenario("double_integrator", trigger_setting(trigger), ideal=ideal)
 
 
 def test_a_quadratic_rule_of_one_output_needs_no_other_errors() -> None:

@@ -1,4 +1,4 @@
-"""Witnesses that the search finds are accepted; changed ones are not."""
+"""What witnesses prove of some loops, and that they prove nothing about others."""
 
 import copy
 import math
@@ -8,62 +8,24 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
-from noack.theory.witnesses.documents import Witness, find_witness
-from noack.theory.witnesses.effort import NoWitnessError
-from noack_check.balls import matrix, number, zeros
+from noack_check.balls import matrix, number
 from noack_check.check import RejectedError
-from noack_check.loop import Loop, Rule, Times
+from noack_check.loop import Loop, Times
 from noack_check.proof import prove
 from noack_check.sentences import assumptions
 from tests.checker.completed import completed
+from tests.checker.loops import IDEAL, SCHEDULE, bounds_of, changed, double_integrator, holding, relative
+from tests.checker.proofs import Proved, proved
 from tests.checker.runs import exceeded
-
-IDEAL = Times(fmpq(0), fmpq(0), fmpq(0), fmpq(0), fmpq(0))
-SCHEDULE = Times(fmpq(1, 100), fmpq(1, 100), fmpq(1, 50), fmpq(3, 100), fmpq(1, 50))
-
-
-def double_integrator(
-    times: Times = SCHEDULE, *, level: float = 0.05, floor: float = 0.0, losses: int = 2
-) -> Loop:
-    A, B, K = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[-1.0, -1.4]]
-    rule = Rule(matrix([[0, 0, 1, 0], [0, 0, 0, 1]]), zeros(0, 4), number(level), number(0.3), number(floor))
-    return Loop(
-        A=matrix([[0.0, 1.0], [0.0, 0.0]]),
-        B=matrix([[0.0], [0.9]]),
-        half_A=zeros(2, 2),
-        half_B=zeros(2, 1),
-        model_A=matrix(A),
-        model_B=matrix(B),
-        gain=matrix(K),
-        weight=matrix([[1, 0], [0, 1]]),
-        holds=False,
-        start=matrix([[1.0], [0.0]]),
-        rule=rule,
-        pushes=zeros(2, 0),
-        sizes=(),
-        noise=zeros(2, 0),
-        losses=2,
-        times=times,
-    )
 
 
 @pytest.fixture(scope="module")
-def witness() -> Witness:
-    return find_witness(double_integrator())
+def witness() -> Proved:
+    return proved("double_integrator")
 
 
-def bounds_of(witness: Witness) -> dict[str, float]:
-    sizes: dict[str, float] = {}
-    for bound in witness.proof.bounds:
-        if not bound.from_start:
-            continue
-        size = math.hypot(float(bound.decaying.mid()), float(bound.constant.mid()))
-        sizes[bound.output] = min(size, sizes.get(bound.output, math.inf))
-    return sizes
-
-
-def test_bounds_are_near_what_is_simulated(witness: Witness) -> None:
-    sizes = bounds_of(witness)
+def test_bounds_are_near_what_is_simulated(witness: Proved) -> None:
+    sizes = bounds_of(witness.proof)
     assert 1.0 <= sizes["x"] < 1.5  # it begins at 1
     assert 0.05 <= sizes["e_s"] < 0.06  # the threshold is 0.05
     assert sizes["e_s"] < sizes["e_c"] < 0.4
@@ -71,11 +33,11 @@ def test_bounds_are_near_what_is_simulated(witness: Witness) -> None:
     assert 0.02 <= float(witness.proof.inter_event) < 0.2
 
 
-@pytest.mark.parametrize("floor", [0.0, 0.01])
-def test_ideal_conditions_give_smaller_bounds(witness: Witness, floor: float) -> None:
-    ideal = bounds_of(find_witness(double_integrator(IDEAL, floor=floor)))
+@pytest.mark.parametrize(("name", "floor"), [("ideal", 0.0), ("ideal_floor", 0.01)])
+def test_ideal_conditions_give_smaller_bounds(witness: Proved, name: str, floor: float) -> None:
+    ideal = bounds_of(proved(name).proof)
     assert ideal["e_s"] <= math.hypot(0.05, floor) * (1 + 1e-6)
-    assert ideal["x"] < bounds_of(witness)["x"] + floor
+    assert ideal["x"] < bounds_of(witness.proof)["x"] + floor
 
 
 CHANGES: dict[str, tuple[Callable[[Loop], Loop], str]] = {
@@ -120,7 +82,7 @@ CHANGES: dict[str, tuple[Callable[[Loop], Loop], str]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_witness_proves_nothing_about_another_loop(witness: Witness, change: str) -> None:
+def test_a_witness_proves_nothing_about_another_loop(witness: Proved, change: str) -> None:
     apply, reason = CHANGES[change]
     loop = apply(double_integrator())
     for signal in (0.0, 1e-6, 1e-3, 1.0):
@@ -131,50 +93,33 @@ def test_a_witness_proves_nothing_about_another_loop(witness: Witness, change: s
             prove(loop, document)
 
 
-def test_no_number_of_a_witness_may_be_missing_or_negative(witness: Witness) -> None:
-    for index, entry in enumerate(witness.document["bounds"]):  # type: ignore[arg-type, var-annotated]
+def test_no_number_of_a_witness_may_be_missing_or_negative(witness: Proved) -> None:
+    for index, entry in enumerate(witness.document["bounds"]):
         for table in ("numbers", "matrices"):
             for name in list(entry[table])[::6]:
-                changed = copy.deepcopy(dict(witness.document))
-                del changed["bounds"][index][table][name]  # type: ignore[index]
+                document = copy.deepcopy(witness.document)
+                del document["bounds"][index][table][name]
                 with pytest.raises(RejectedError, match="missing"):
-                    prove(double_integrator(), changed)
-
-
-def test_a_loop_that_does_not_decay_has_no_witness() -> None:
-    loop = double_integrator()
-    with pytest.raises(NoWitnessError, match="does not decay"):
-        find_witness(loop._replace(gain=loop.gain * -1))
-
-
-def holding(level: float = 0.0, floor: float = 0.02) -> Loop:
-    return double_integrator(IDEAL, level=level, floor=floor)._replace(holds=True)
+                    prove(double_integrator(), document)
 
 
 def test_a_loop_that_holds_updates_has_bounds_by_the_chain() -> None:
-    sizes = bounds_of(find_witness(holding(level=0.05)))
+    sizes = bounds_of(proved("holding_decaying").proof)
     assert 1.0 <= sizes["x"] < 1.2
     assert sizes["e_c"] == pytest.approx(3 * 0.05)
 
 
 def test_at_rate_0_the_bounds_are_those_of_the_largest_threshold() -> None:
-    witness = find_witness(holding())
+    witness = proved("holding")
     assert not witness.proof.rate > 0
-    prove(holding(), witness.document)
     with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
         prove(holding(level=0.05), completed(holding(level=0.05), witness.document))
 
 
-def relative(sigma: float) -> Loop:
-    """The rule ‖e_s‖ > σ‖x‖."""
-    loop = double_integrator(IDEAL, level=0.0)
-    return loop._replace(rule=loop.rule._replace(negative=matrix([[sigma, 0, 0, 0], [0, sigma, 0, 0]])))
-
-
 @pytest.mark.parametrize("sigma", [0.02, 0.2])
 def test_a_relative_rule_has_decaying_bounds(sigma: float) -> None:
-    witness = find_witness(relative(sigma))
-    sizes = bounds_of(witness)
+    witness = proved(f"relative_{sigma}")
+    sizes = bounds_of(witness.proof)
     assert witness.proof.rate > 0
     assert 1.0 <= sizes["x"] < 1.25
     assert sizes["e_s"] < 1.25 * sigma
@@ -184,18 +129,14 @@ def test_a_relative_rule_has_decaying_bounds(sigma: float) -> None:
 
 
 def test_without_a_bound_of_the_drift_tests_say_how_many_events_come_while_an_update_is_on_its_way() -> None:
-    tests = IDEAL._replace(sampling=fmpq(1, 100), least_sampling=fmpq(1, 100), delay=fmpq(1, 100))
-    witness = find_witness(relative(0.1)._replace(times=tests))
-    later = relative(0.1)._replace(times=tests._replace(least_sampling=fmpq(1, 200)))
+    witness = proved("relative_tested")
+    later = changed(witness.loop, least_sampling=fmpq(1, 200))
     with pytest.raises(RejectedError, match="later: more events"):
         prove(later, witness.document)
 
 
 def test_in_the_limit_bounds_are_those_of_disturbances_and_the_floor() -> None:
-    push = matrix([[0.0], [0.1]])
-    loop = double_integrator(floor=0.05)._replace(pushes=push, sizes=(arb(1),))
-    witness = find_witness(loop, ("x",), ultimate=("x", "y[1]"))
-    whole, ultimate, rate, *_ = witness.proof.bounds
+    whole, ultimate, rate, *_ = proved("in_the_limit").proof.bounds
     assert (whole.from_start, ultimate.from_start, rate.from_start) == (True, False, False)
     assert 0.1 < float(ultimate.constant.mid()) < 0.7
     assert ultimate.constant <= whole.constant
@@ -204,9 +145,9 @@ def test_in_the_limit_bounds_are_those_of_disturbances_and_the_floor() -> None:
 
 def test_an_output_is_bounded_more_tightly_than_by_the_norm_of_the_state() -> None:
     """The state turns: where both entries have opposite signs their sum is small."""
-    loop = double_integrator()._replace(outputs=matrix([[1.0, 1.0], [0.0, 3.0]]))
-    witness = find_witness(loop, ("x", "y[0]", "y[1]"))
-    sizes = bounds_of(witness)
+    witness = proved("outputs")
+    loop = witness.loop
+    sizes = bounds_of(witness.proof)
     assert sizes["y[0]"] < 0.9 * math.sqrt(2) * sizes["x"]
     assert sizes["y[1]"] < 0.9 * 3 * sizes["x"]
     rng = np.random.default_rng(5)

@@ -1,21 +1,26 @@
-"""A pendulum in lossy loops under attack, many runs at a time; independent of the project's simulators.
+"""Plants with equations in lossy loops under attack, many runs at a time.
 
-The plant is written down once more, for many states at a time. A run meets the conditions of a
-certificate and no more: tests every h, updates that take up to d, inputs up to σ old, no input
-before t_a, and losses that an attacker chooses up to the longest burst.
+Independent of noack's simulators and of :mod:`tests.checker.runs`, whose steps are exact and need linear
+plants: here the classical Runge-Kutta method integrates x, and x_s and x_c follow the model. A run meets the
+conditions of a loop and no more: tests every h, updates that take up to d, inputs up to σ old, no input
+before t_a, and losses that an attacker chooses up to the longest burst. Where a loop is tested at all times
+a run is tested at each step: its events are up to a step late.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from flint import arb
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from noack.scenario.resolution import loop_of
-from noack.scenario.scenario import Scenario
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.proven_bounds import ProvenBounds
+from noack_check.loop import Loop
+from tests.checker.runs import floats
 
 Reals = NDArray[np.float64]
+Field = Callable[[Reals, Reals], Reals]
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
@@ -24,43 +29,50 @@ def pendulum(x: Reals, u: Reals) -> Reals:
     return np.stack([x[1], 9.81 * np.sin(x[0]) - 0.1 * x[1] + u[0]])
 
 
-def attacked(
-    resolved: Scenario,
-    certificate: ScenarioCertificate,
-    *,
-    runs: int,
-    steps: int,
-    seed: int = 0,
-) -> dict[str, float]:
-    """Return the largest shares of the region and of the bounds that any of the runs used.
+def largest_sizes(
+    loop: Loop, field: Field, *, step_s: float, steps: int, runs: int, seed: int = 0
+) -> dict[str, Reals]:
+    """Return the largest size of each output over all runs, (steps,); NaN counts as infinite.
 
-    NaN, of a plant outside its equations' domain, counts as infinite.
+    Args:
+        loop: the loop.
+        field: ẋ of states and inputs, (n, runs) and (m, runs).
+        step_s: time between two steps, of which there is a test at each.
+        steps: the number of steps.
+        runs: the number of runs.
+        seed: of what the attackers draw.
     """
-    t_s = np.arange(steps) * certificate.conditions.sampling_s
-    loops = _AttackedLoops(resolved, certificate, runs, np.random.default_rng(seed))
-    worst = dict.fromkeys(("x", "u", "‖x‖", "‖e_s‖", "‖e_c‖"), 0.0)
-    n, proven = len(loops.x), certificate.proven
-    assert proven is not None
-    entries = proven.entries(n, 1)
-    limits = np.array([sum(entries[k]) if k in entries else np.inf for k in range(n + 1)])[:, None]
-    limit_x, limit_u = limits[:n], limits[n:]
-    bounds = [of(t_s) for of in (certificate.state, certificate.sensor_error, certificate.controller_error)]
+    loops = _AttackedLoops(loop, field, step_s, runs, np.random.default_rng(seed))
+    n, m = loops.x.shape[0], len(loops.gain)
+    names = ("x", "e_s", "e_c", *(f"x[{i}]" for i in range(n)), *(f"u[{j}]" for j in range(m)))
+    found = {name: np.zeros(steps) for name in names}
 
-    def share(signal: str, values: Reals, limits: Reals | float) -> None:
-        used = np.max(values / limits, initial=0.0)
-        worst[signal] = max(worst[signal], np.inf if np.isnan(used) else float(used))
+    def note(name: str, number: int, sizes: Reals) -> None:
+        most = np.max(sizes, initial=0.0)
+        found[name][number] = np.inf if np.isnan(most) else most
 
-    for number, t in enumerate(t_s.tolist()):
-        share("‖e_s‖", loops.error_of(loops.x_s), bounds[1][number])
-        loops.transmit(number, loops.events(number, t))
+    for number in range(steps):
+        note("e_s", number, loops.error_of(loops.x_s))
+        loops.transmit(number, loops.events(number))
         loops.receive(number)
         u = loops.inputs()
-        share("x", np.abs(loops.x), limit_x)
-        share("u", np.abs(u), limit_u)
-        share("‖x‖", np.linalg.norm(loops.x, axis=0), bounds[0][number])
-        share("‖e_c‖", loops.error_of(loops.x_c)[loops.newest > 0], bounds[2][number])
+        note("x", number, np.linalg.norm(loops.x, axis=0))
+        note("e_c", number, loops.error_of(loops.x_c)[loops.newest > 0])
+        for k, row in enumerate(np.abs(loops.x)):
+            note(f"x[{k}]", number, row)
+        for k, row in enumerate(np.abs(u)):
+            note(f"u[{k}]", number, row)
         loops.advance(u)
-    return worst
+    return found
+
+
+def largest_shares(sizes: dict[str, Reals], bounds: ProvenBounds, step_s: float) -> dict[str, float]:
+    """Return the largest share of each proven bound that some sizes reach."""
+    return {
+        name: float((size / bounds.at(name, np.arange(len(size)) * step_s)).max())
+        for name, size in sizes.items()
+        if name in bounds.bounds
+    }
 
 
 class _AttackedLoops:
@@ -70,24 +82,21 @@ class _AttackedLoops:
     ages of the inputs, are random, or always the longest.
     """
 
-    def __init__(
-        self,
-        resolved: Scenario,
-        certificate: ScenarioCertificate,
-        runs: int,
-        rng: np.random.Generator,
-    ) -> None:
-        self.runs, self.rng, self.rule = runs, rng, resolved.decaying
-        self.conditions, loop = certificate.conditions, loop_of(resolved)
-        self.h = self.conditions.sampling_s
-        self.weight = np.eye(loop.n) if loop.weight is None else loop.weight
-        self.longest = int(self.conditions.delay_s / self.h + 1e-9)
-        ages = np.linspace(0, self.conditions.hold_s - self.h, 4)
+    def __init__(self, loop: Loop, field: Field, step_s: float, runs: int, rng: np.random.Generator) -> None:
+        self.field, self.h, self.runs, self.rng, self.losses = field, step_s, runs, rng, loop.losses
+        self.level, self.rate, self.floor = (
+            float(v.mid()) for v in (loop.rule.level, loop.rule.rate, loop.rule.floor)
+        )
+        self.gain, self.weight, H = floats(loop.gain), floats(loop.weight), floats(loop.H)
+        sampling_s, delay_s, age_s, start_s = (float(arb(loop.times[k]).mid()) for k in (0, 2, 3, 4))
+        self.longest, self.first = (int(time_s / step_s + 1e-9) for time_s in (delay_s, start_s))
+        ages = np.linspace(0, max(age_s - sampling_s, 0.0), 4)
+        self.is_held = age_s > 0
         # What e^{Ht} makes of x_s and x_c in a step, of a late update, and of K for an old input.
-        self.model_step = expm(loop.H * self.h)
-        self.late = np.array([expm(loop.H * self.h * steps) for steps in range(self.longest + 1)])
-        self.aged_gains = np.array([loop.K @ expm(-loop.H * age) for age in ages])
-        self.x = np.tile(loop.x0[:, None], runs)
+        self.half_step, self.model_step = expm(H * step_s / 2), expm(H * step_s)
+        self.late = np.array([expm(H * step_s * steps) for steps in range(self.longest + 1)])
+        self.aged_gains = np.array([self.gain @ expm(-H * age) for age in ages])
+        self.x = np.tile(floats(loop.start), runs)
         self.x_s, self.x_c = self.x.copy(), np.zeros_like(self.x)
         self.loss_rates = rng.choice([0.3, 0.6, 0.9, 1.0], runs)
         self.always_longest = rng.random(runs) < 0.5
@@ -100,25 +109,24 @@ class _AttackedLoops:
         """‖e‖_W of each run."""
         return np.asarray(np.linalg.norm(self.weight @ (estimates - self.x), axis=0))
 
-    def events(self, number: int, t_s: float) -> NDArray[np.bool_]:
+    def events(self, number: int) -> NDArray[np.bool_]:
         """Test the trigger; the first test is an event."""
         if not number:
             return np.ones(self.runs, bool)
-        threshold = max(self.rule.beta * np.exp(-self.rule.alpha_per_s * t_s), self.rule.floor)
+        threshold = max(self.level * np.exp(-self.rate * number * self.h), self.floor)
         return np.asarray(self.error_of(self.x_s) > threshold)
 
     def transmit(self, number: int, event: NDArray[np.bool_]) -> None:
         """Reset x_s at events; the attacker loses an update, or delays it."""
         wants_loss = self.rng.random(self.runs) < self.loss_rates
-        lost = event & wants_loss & (self.consecutive_losses < self.conditions.dropouts) & (number > 0)
+        lost = event & wants_loss & (self.consecutive_losses < self.losses) & (number > 0)
         losses = np.where(lost, self.consecutive_losses + 1, 0)
         self.consecutive_losses = np.where(event, losses, self.consecutive_losses)
         self.sent = self.sent + event
         self.x_s = np.where(event, self.x, self.x_s)
         random_delay = self.rng.integers(0, self.longest + 1, self.runs)
         delay = np.where(self.always_longest, self.longest, random_delay)
-        first_delay = np.minimum(delay, int(self.conditions.start_s / self.h + 1e-9))
-        arrival = (number + (delay if number else first_delay)) % (self.longest + 1)
+        arrival = (number + (delay if number else np.minimum(delay, self.first))) % (self.longest + 1)
         delivered = np.flatnonzero(event & ~lost)
         updates = np.einsum("rij,jr->ri", self.late[delay[delivered]], self.x[:, delivered])
         self.arriving[arrival[delivered], :, delivered] = updates
@@ -140,10 +148,16 @@ class _AttackedLoops:
         return np.where(self.newest > 0, u, 0.0)
 
     def advance(self, u: Reals) -> None:
-        """Integrate the plants over a step by the classical Runge-Kutta method, and the models."""
-        x, h = self.x, self.h
-        k1 = pendulum(x, u)
-        k2 = pendulum(x + h / 2 * k1, u)
-        k3 = pendulum(x + h / 2 * k2, u)
-        self.x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + pendulum(x + h * k3, u))
+        """Integrate the plants over a step by the classical Runge-Kutta method, and the models.
+
+        An input is held, unless none may be old.
+        """
+        x, h, f = self.x, self.h, self.field
+        middle, end = u, u
+        if not self.is_held:
+            middle, end = (self.gain @ M @ self.x_c for M in (self.half_step, self.model_step))
+        k1 = f(x, u)
+        k2 = f(x + h / 2 * k1, middle)
+        k3 = f(x + h / 2 * k2, middle)
+        self.x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(x + h * k3, end))
         self.x_s, self.x_c = self.model_step @ self.x_s, self.model_step @ self.x_c

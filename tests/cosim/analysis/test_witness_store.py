@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
-from noack.theory.witnesses.documents import Witness, find_witness, witness_by_gains
+from cosim.analysis.witnesses import WitnessedStatement, find_statement
+from noack.theory.witnesses.documents import Witness, witness_by_gains
 from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.loop import Loop
-from noack_check.scenario import read_loop
+from tests.checker.proofs import proved
 from tests.helpers.shipped import resolved
 
 
@@ -24,9 +24,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="module")
 def witness() -> Witness:
-    """What is found of the loop below; the search takes a second."""
-    content = resolved_content(resolved("double_integrator"))
-    return find_witness(read_loop(content, box=False, ideal=False))
+    """What is found of the loop below."""
+    found = proved("of_scenario")
+    return Witness(found.document, found.proof)
 
 
 @pytest.fixture

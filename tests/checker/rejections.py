@@ -1,0 +1,29 @@
+"""Documents that are rejected: the reason is one line, and names what fails."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from noack_check.balls import is_positive, matrix, number
+from noack_check.check import RejectedError, _value
+from noack_check.loop import Loop
+from noack_check.model import Model
+from noack_check.proof import prove
+
+
+def rejects(loop: Loop, document: object, match: str) -> None:
+    """Require that a document is rejected, and for the reason that is meant."""
+    with pytest.raises(RejectedError, match=match) as caught:
+        prove(loop, document)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) <= 300
+
+
+def failing(loop: Loop, entry: Mapping[str, Any], rate: float) -> set[str]:
+    """Return the names of all inequalities that fail."""
+    model = Model(loop, number(rate), number(entry["decay"]))
+    matrices = {name: matrix(rows) for name, rows in entry["matrices"].items()}
+    numbers = {name: number(value) for name, value in entry["numbers"].items()}
+    every = model.inequalities(entry["output"], starts=True)
+    return {item.name for item in every if not is_positive(_value(item, matrices, numbers))}
