@@ -39,6 +39,17 @@ class Exceeded(NamedTuple):
     bound: float
 
 
+class _Sample(NamedTuple):
+    """The states at a time of a run, the age of the input that acts, and the signs of the disturbances."""
+
+    time: float
+    z: Array
+    """x, x_s, x_c, x̂ and 1."""
+    age: float | None
+    """None: no input acts yet."""
+    signs: tuple[float, ...]
+
+
 class _Plant:
     """One plant of the box; steps under an input K e^{−Hs} x_c of some age and a disturbance."""
 
@@ -76,7 +87,7 @@ def exceeded(
     """Return where a random run exceeds what is proven; by forms this is a root of a sum of squares."""
     plant, times, rule = _Plant(loop, rng), [float(t.p) / float(t.q) for t in loop.times], loop.rule
     sampling, least, delay, age, start, *periods, dwell, longest, due = times
-    next_event = rng.choice(periods) if periods[1] else np.inf  # of a periodic rule
+    next_event = float(rng.choice(periods)) if periods[1] else np.inf  # of a periodic rule
     if periods[1] and loop.observer is None:
         least = sampling = periods[1] / _PARTS
     W, n, positive, negative = floats(loop.weight), loop.n, floats(rule.positive), floats(rule.negative)
@@ -105,7 +116,7 @@ def exceeded(
     y = measured(x, x, x if loop.observer is None else x + floats(loop.observer.start)[:, 0])
     z = np.concatenate([x, y, y, y, [1.0]])
     remembered.start(y)
-    first_input = start * rng.choice([0.0, 1.0, rng.random()])
+    first_input = start * float(rng.choice([0.0, 1.0, rng.random()]))
     style = rng.integers(3)
     ages = [0.0, age, age / 2]
     t, lost, events = 0.0, 0, [0.0]
@@ -115,12 +126,7 @@ def exceeded(
     next_test, found = sampling, list[Exceeded]()
     current = ages[rng.integers(3)]
     signs = tuple(rng.choice([-1.0, 1.0], len(loop.sizes)))
-    bounds = [
-        (b.output, float(b.decaying.mid()), float(b.constant.mid())) for b in proof.bounds if b.from_start
-    ]
-    early = [b for b in bounds if b[0] != "drift" and (proof.is_quiet or b[0] != "e_c")]
-    """Those that hold before the first input acts, too."""
-    r = float(proof.rate.mid())
+    samples: list[_Sample] = []
     while t < until:
         stop = min(v for v in (next_test, next_event, *(update[0] for update in arriving)) if v > t)
         if t < first_input < stop:
@@ -131,9 +137,7 @@ def exceeded(
             z = step @ z
             decay = plant.predict(round((stop - t) / 2, 12))
             arriving = [(acts, sent, decay @ state) for acts, sent, state in arriving]
-            compared = bounds if acting is not None else early
-            at = t + half * (stop - t) / 2
-            _compare(found, plant, z, W, at, compared, r, acting, signs, by_forms=by_forms)
+            samples.append(_Sample(t + half * (stop - t) / 2, z.copy(), acting, signs))
         t = stop
         if acting_now := [update for update in arriving if update[0] <= t]:
             newest = max(acting_now, key=lambda update: update[1])
@@ -167,17 +171,17 @@ def exceeded(
                 loses = lost < loop.losses and (style == 0 or (style == 1 and rng.random() < 0.7))
                 lost = lost + 1 if loses else 0
                 if not loses and delay:
-                    late = delay * rng.choice([1.0, 1.0, 0.5, 0.0])
+                    late = delay * float(rng.choice([1.0, 1.0, 0.5, 0.0]))
                     acts = max(t + max(round(late, 9), 1e-9), first_input)
                     arriving.append((acts, t, z[n : 2 * n].copy()))
                 elif not loses:
                     z[2 * n : 3 * n] = z[n : 2 * n]
-                next_event = t + rng.choice(periods) if periods[1] else np.inf
-            next_test = t + (round(rng.choice([least, sampling]), 9))
+                next_event = t + float(rng.choice(periods)) if periods[1] else np.inf
+            next_test = t + round(float(rng.choice([least, sampling])), 9)
             current = ages[rng.integers(3)] if rng.random() < 0.3 else current
             if rng.random() < 0.05:
                 signs = tuple(rng.choice([-1.0, 1.0], len(loop.sizes)))
-    return found
+    return found + _compare(plant, W, proof, samples, by_forms=by_forms)
 
 
 def longest(times: Iterable[fmpq | None]) -> fmpq | None:
@@ -243,27 +247,28 @@ def _apart(found: list[Exceeded], proof: Proof, events: list[float], t: float, f
 
 
 def _compare(
-    found: list[Exceeded],
-    plant: _Plant,
-    z: Array,
-    W: Array,
-    t: float,
-    bounds: list[tuple[str, float, float]],
-    rate: float,
-    age: float | None,
-    signs: tuple[float, ...],
-    *,
-    by_forms: bool,
-) -> None:
+    plant: _Plant, W: Array, proof: Proof, samples: list[_Sample], *, by_forms: bool
+) -> list[Exceeded]:
+    """Return where the samples of a run exceed the bounds."""
     n = plant.n
-    x, xs, xc = z[:n], z[n : 2 * n], z[2 * n : 3 * n]
-    u = plant.input_matrix(age) @ xc if age is not None else np.zeros(len(plant.gain))
-    motion = plant.A @ x + plant.B @ u + plant.pushes @ np.array(signs)
-    values = {"x": x, "e_s": W @ (xs - x), "e_c": W @ (xc - x), "drift": W @ (motion - plant.H @ x)}
-    entries = {"x": x, "u": u, "y": plant.outputs @ x}
-    for output, decaying, constant in bounds:
-        value = values[output] if output in values else entries[output[0]][[int(output[2:-1])]]
+    t, z = (np.array([sample[k] for sample in samples]) for k in (0, 1))
+    x, xs, xc = z[:, :n], z[:, n : 2 * n], z[:, 2 * n : 3 * n]
+    acts = np.array([sample.age is not None for sample in samples])
+    u = np.array([plant.input_matrix(sample.age) @ state for sample, state in zip(samples, xc, strict=True)])
+    pushes = np.array([sample.signs for sample in samples]).reshape(len(t), -1) @ plant.pushes.T
+    drift = x @ plant.A.T + u @ plant.B.T + pushes - x @ plant.H.T
+    values = {"x": x, "e_s": (xs - x) @ W.T, "e_c": (xc - x) @ W.T, "drift": drift @ W.T}
+    entries = {"x": x, "u": u, "y": x @ plant.outputs.T}
+    fading, found = np.exp(-float(proof.rate.mid()) * t), list[Exceeded]()
+    for bound in proof.bounds:
+        if not bound.from_start:
+            continue
+        output = bound.output
+        value = values[output] if output in values else entries[output[0]][:, [int(output[2:-1])]]
         added = np.hypot if by_forms and output not in {"e_s", "e_c"} else np.add
-        size, bound = float(np.linalg.norm(value)), float(added(decaying * np.exp(-rate * t), constant))
-        if size > bound * (1 + _ROUNDING):
-            found.append(Exceeded(output, t, size, bound))
+        sizes = np.linalg.norm(value, axis=1)
+        limits = added(float(bound.decaying.mid()) * fading, float(bound.constant.mid()))
+        holds_early = output != "drift" and (proof.is_quiet or output != "e_c")  # before the first input
+        over = (sizes > limits * (1 + _ROUNDING)) & (acts | holds_early)
+        found += [Exceeded(output, *map(float, (t[k], sizes[k], limits[k]))) for k in np.flatnonzero(over)]
+    return found
