@@ -89,18 +89,18 @@ class _TheoryWarnings(RunObserver):
 
 
 def warn_of_violations(loaded: Scenario, *, is_sampled: bool = True) -> None:
-    """Print on standard error what Theorem 2 assumes and the scenario violates.
+    """Print on standard error which assumptions gain and threshold violate.
 
     Of a sampled run also the periods that do not divide each other.
     """
-    from noack.theory.certificates.assumptions import violations_of_theorem_2
+    from noack.theory.certificates.assumptions import violated_by_gain_or_threshold
 
     run = ResolvedRun(loaded)
     for entry in run.entries:
         prefix = f"{entry.name}: " if len(run.names) > 1 else ""
         resolved = resolve(entry.scenario)
         uneven = uneven_periods(resolved) if is_sampled else ()
-        for line in (*violations_of_theorem_2(resolved), *uneven):
+        for line in (*violated_by_gain_or_threshold(resolved), *uneven):
             print(f"noack: warning: {prefix}{line}", file=sys.stderr)
 
 

@@ -34,7 +34,7 @@ def check_scenario(loaded: Scenario, *, json: bool) -> None:
     console = standard_console()
     console.width -= len(_COMMENT)
     with console.capture() as captured:  # printed last: the plant may be rejected
-        console.print("the paper's assumptions for this scenario:")
+        console.print("assumptions about this scenario:")
         console.print(terminal_table(assumption_table(assumptions(resolved))))
         _print_plant(console, resolved)
     if json:

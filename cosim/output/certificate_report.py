@@ -13,7 +13,7 @@ from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.analysis.tried_settings import MOST_S, TriedSettings
 from cosim.output.document import Block, Document, Sentence, SentenceRole
-from cosim.output.guarantee_sentence import although_lost, guarantee_sentence
+from cosim.output.guarantee_sentence import although_lost, guarantee_sentence, is_within_allowed
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
 from cosim.simulation.sampled_loop import SampledLoop
@@ -21,7 +21,7 @@ from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most, duration_at_least, number
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
+from noack.theory.certificates.assumptions import AssumptionStatus, paper_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import EQUATIONS, outside_box
 from noack.theory.witnesses.loss_margin import Stability
@@ -30,7 +30,8 @@ _MOST_BOUNDS = 6
 """Outputs whose bounds are printed without --verbose."""
 _MORE = Sentence(
     role=SentenceRole.NOTE,
-    text="--verbose shows every bound, the largest settings, the assumptions, and the paper's theorems",
+    text="--verbose shows every bound, the largest settings and the assumptions; --paper shows the paper's "
+    "theorems",
 )
 _MEANING = (
     "t in s. paper: no sampling, no delay, no hold. schedule: the scenario's rates, plus the lateness that "
@@ -39,15 +40,22 @@ _MEANING = (
 )
 
 
-def certificate_document(results: Certificates, *, verbose: bool = False) -> Document:
+def certificate_document(results: Certificates, *, verbose: bool = False, paper: bool = False) -> Document:
     """Return what is guaranteed: a sentence and few lines, or with ``verbose`` all tables, too.
 
     Args:
         results: the certificates.
         verbose: with every bound, the largest settings and the assumptions.
+        paper: with the paper's assumptions and statements.
     """
     blocks: list[Block] = [_first_sentence(results), *_too_large(results)]
-    blocks += _all_tables(results) if verbose else [*_few_lines(results), _MORE]
+    blocks += _all_tables(results) if verbose else _few_lines(results)
+    if paper or (verbose and results.scenario.certificate.paper):
+        blocks += _paper(results)
+    if verbose:
+        blocks += map(_prose, (*_in_words(results), *_stability_in_words(results)))
+    else:
+        blocks.append(_MORE)
     if not results.answer.is_certified:
         blocks.append(_advice(results))
     return Document(title=results.scenario.name, data=results.to_json(), blocks=blocks)
@@ -73,15 +81,27 @@ def _all_tables(results: Certificates) -> Iterator[Block]:
         yield _doubt("the box certificates do not cover this plant:", outside)
     yield _prose("assumptions of the certificates for the schedule:")
     yield assumption_table(results.schedule.assumptions)
+
+
+def _paper(results: Certificates) -> Iterator[Block]:
+    """Yield the paper's assumptions and statements, which are about a continuous trigger."""
+    certificate = results.paper
+    if not (certificate is not None and certificate.has("x")):
+        yield _prose("under the paper's conditions, without sampling, delay and hold, no bound is proven")
+    else:
+        only = "only " if results.guaranteed is None else ""
+        formula = certificate.formula(state_norm(results), "x")
+        yield _prose(
+            f"proved {only}under the paper's conditions, without sampling, delay and hold: {formula}"
+        )
     yield _prose("assumptions of the paper's theorems:")
-    yield assumption_table(assumptions(results.scenario))
+    yield assumption_table(paper_assumptions(results.scenario))
     if (theorem := results.theorem_2) is not None:
         yield _prose(
             f"the paper's Theorem 2, computed with the proven Δ = {at_most(theorem.delta)}: events are at "
             f"least {at_least(theorem.inter_event_s)} s apart, and "
             f"‖x‖ ≤ {at_most(theorem.state_start + theorem.state_forced)}"
         )
-    yield from map(_prose, (*_in_words(results), *_stability_in_words(results)))
 
 
 def _few_lines(results: Certificates) -> Iterator[Sentence]:
@@ -101,9 +121,6 @@ def _few_lines(results: Certificates) -> Iterator[Sentence]:
             yield _prose(_apart_in_words(certificate, apart_s))
         assumed = [each.what for each in certificate.assumptions if each.verdict is AssumptionStatus.ASSUMED]
         yield _prose(f"assumed, and checked in each run: {'; '.join(assumed)}")
-    elif (paper := results.paper) is not None and paper.has("x"):
-        formula = paper.formula(state_norm(results), "x")
-        yield _prose(f"proved only under the paper's conditions, without sampling, delay and hold: {formula}")
     if (outside := outside_box(results.scenario)) is not None:
         yield _doubt("the stated uncertainty does not contain this plant:", outside)
     yield from map(_prose, _stability_in_words(results))
@@ -120,7 +137,8 @@ def _first_sentence(results: Certificates) -> Sentence:
     """Return what is guaranteed, in one sentence."""
     text = guarantee_sentence(results)
     if text is not None:
-        return Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.GOOD, is_prose=True)
+        tone = Tone.GOOD if is_within_allowed(results) else Tone.DOUBTFUL
+        return Sentence(text=text, role=SentenceRole.VERDICT, tone=tone, is_prose=True)
     why = results.answer.text.removeprefix("no certificate").lstrip(": ")
     if _is_stable(results):
         text = f"stable if nothing is late{although_lost(results.scenario)} (proved); no bound: {why}"

@@ -24,6 +24,12 @@ def guarantee_sentence(results: Certificates) -> str | None:
     return f"{' and '.join(statements)}{_until(results)}{losses}{plants} (proved)"
 
 
+def is_within_allowed(results: Certificates) -> bool:
+    """Return whether bounds are proven, and those of all stated outputs are within their allowed errors."""
+    certificate = results.guaranteed
+    return certificate is not None and all(bound.is_met for bound in results.output_bounds(certificate))
+
+
 def _until(results: Certificates) -> str:
     """Return up to when a guarantee about a reference holds; empty: for ever."""
     if results.jump_s is not None:

@@ -229,7 +229,7 @@ def _claims(report: Report) -> Iterator[Block]:
 
 def _assumptions(report: Report) -> Iterator[Block]:
     if report.loop.assumptions:
-        yield Heading("The paper's assumptions")
+        yield Heading("Assumptions")
         yield assumption_table(report.loop.assumptions)
 
 

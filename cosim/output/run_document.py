@@ -67,7 +67,7 @@ def _details(summary: RunSummary) -> list[Block]:
     if "timing" in tables:
         blocks += [tables["timing"], *_realtime(loop.realtime)]
     blocks += [
-        Sentence(text="the paper's assumptions for this scenario:"), assumption_table(loop.assumptions)
+        Sentence(text="assumptions about this scenario:"), assumption_table(loop.assumptions)
     ]  # fmt: skip
     if "claims" in tables:
         blocks += [tables["claims"], *_notes_on_claims(loop.claims)]

@@ -24,6 +24,9 @@ class CertificateSection(ScenarioSection):
     run exceeds with at most this probability."""
     prove: bool = True
     """At the end of a run, search for witnesses of the certificates' bounds, for some seconds."""
+    paper: bool = False
+    """Check the paper's statements and assumptions in runs, too: they are about a continuous trigger and a
+    network without delay, which no run has."""
 
 
 class ClocksSection(ScenarioSection):

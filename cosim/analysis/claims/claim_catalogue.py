@@ -17,6 +17,7 @@ from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from noack.core.linear_systems import Propagator
 from noack.core.number_format import at_most
 from noack.core.row_operations import row_norms
+from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import EQUATIONS
 from noack.theory.certificates.output_bounds import OutputBound, escaped, output_bounds
@@ -418,7 +419,7 @@ def region(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate)
     return ClaimBound(Bound(formula, samples.step_s, shares, run.violation_of(certificate)))
 
 
-CLAIMS = (
+CERTIFIED_AND_IDENTITY = (
     controller_error,
     estimation_error,
     inter_event_time,
@@ -427,9 +428,13 @@ CLAIMS = (
     region,
     i1_controller_error,
     i1_model_difference,
-    paper_error_bound,
-    theorem_1_controller_error,
-    theorem_2_inter_event_time,
-    theorem_2_state,
 )
-"""All claims, in the order in which they are evaluated."""
+PAPER = (paper_error_bound, theorem_1_controller_error, theorem_2_inter_event_time, theorem_2_state)
+
+
+def claims_about(scenario: Scenario) -> tuple[ClaimDefinition, ...]:
+    """Return the claims about a run of a scenario, in the order in which they are evaluated.
+
+    The paper's are checked where the scenario asks for them.
+    """
+    return (*CERTIFIED_AND_IDENTITY, *(PAPER if scenario.certificate.paper else ()))

@@ -16,7 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims.claim_catalogue import CLAIMS, Bound, ClaimDefinition, Envelope, output_claims
+from cosim.analysis.claims.claim_catalogue import (
+    Bound,
+    ClaimDefinition,
+    Envelope,
+    claims_about,
+    output_claims,
+)
 from cosim.analysis.claims.common_end import common_end_ns, up_to_common_end
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.reference_deviations import deviations
@@ -271,16 +277,16 @@ class RunClaims:
 
     def _instances(self) -> Iterator[_ClaimInstance]:
         """Yield the claims of each certificate, and those that need none."""
-        certified = self.certified_evidence
+        certified, claims = self.certified_evidence, claims_about(self.record.scenario)
         for certificate in certified.certificates:
             if not certificate.exists:
                 continue
             outside = outside_box(certified.record.scenario) if certificate.scope == BOX else None
-            for claim in (*output_claims(certified, certificate), *CLAIMS):
+            for claim in (*output_claims(certified, certificate), *claims):
                 if claim.is_certified:
                     check = ClaimCheck(claim, certificate.source, certified.until_s)
                     yield _ClaimInstance(claim, certified, check, [], certificate, outside)
-        for claim in CLAIMS:
+        for claim in claims:
             if not claim.is_certified:
                 unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
                 evidence, until_s = (

@@ -78,6 +78,13 @@ def certify(
     verbose: Annotated[
         bool, Option("--verbose", help="Print every bound, the largest settings and the assumptions.")
     ] = False,
+    paper: Annotated[
+        bool,
+        Option(
+            "--paper",
+            help="Print the paper's assumptions and statements, which are about a continuous trigger.",
+        ),
+    ] = False,
     json: opt.JsonOption = False,
 ) -> int:
     """Prove the bounds that are guaranteed for a scenario, and print their conditions.
@@ -112,7 +119,7 @@ def certify(
     if search:
         with work_bar("trying smaller thresholds", lines=True) as bar:
             result.advise(bar)
-    document = certificate_document(result, verbose=verbose or tables is not None)
+    document = certificate_document(result, verbose=verbose or tables is not None, paper=paper)
     show(document, json=json, tables=tables)
     if out is not None:
         save_mat(result.to_json(), out)

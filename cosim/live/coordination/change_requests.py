@@ -114,14 +114,14 @@ class ChangeRequests:
             raise CallerError(f"the change: {error}") from None
 
     def _violations(self) -> list[str]:
-        """Return the violated assumptions of Theorem 2, each as a line, with its loops if not all."""
+        """Return what gain and threshold violate, each as a line, with its loops if not all."""
         # Imports the theory, for which the start of a run does not wait.
-        from noack.theory.certificates.assumptions import violations_of_theorem_2
+        from noack.theory.certificates.assumptions import violated_by_gain_or_threshold
 
         violated: dict[str, list[str]] = {}
         with suppress(Exception):  # a failed analysis must not cost the run
             for name, schedule in self._entries.items():
-                for line in violations_of_theorem_2(resolve(schedule.last)):
+                for line in violated_by_gain_or_threshold(resolve(schedule.last)):
                     violated.setdefault(line, []).append(name)
         return [
             line if len(names) == len(self._entries) else f"{', '.join(names)}: {line}"

@@ -121,7 +121,8 @@ def campaign_document(
     remarks = [*unfinished, *_bursts(summary)]
     more = len(remarks) - _MOST_REMARKS
     more_text = f"and at {more} more grid points: see the page"
-    tone = Tone.DOUBTFUL if unfinished else Tone.GOOD
+    tone = Tone.GOOD if _certified(summary) else Tone.NEUTRAL
+    tone = Tone.DOUBTFUL if unfinished else tone
     blocks: list[Block] = []
     if store is not None and campaign.figures:
         blocks += [Heading("Figures"), *figures(summary, store)]
@@ -175,16 +176,22 @@ def campaign_document(
 
 def _verdict(summary: CampaignSummary) -> str:
     runs = len(summary.results) * summary.draws
-    certified = sum(result.point.certified_error is not None for result in summary.results)
+    certified = _certified(summary)
     if summary.breaches:
         return f"{summary.breaches:,} of {runs:,} runs exceed a certified bound."
     if not certified:
         return (
-            f"{runs:,} runs; no grid point has a certified bound: one needs the paper's trigger without a "
-            "floor, models that decay faster than the threshold (a hold does not), and an enforced guarantee."
+            f"{runs:,} runs; no point of the grid has a certified bound. A bound needs the paper's trigger "
+            "without a floor, models that decay faster than the threshold (a hold does not), and an enforced "
+            "guarantee."
         )
     extent = "all" if certified == len(summary.results) else f"{certified} of {len(summary.results)}"
     return f"{runs:,} runs; {extent} grid points have a certified bound; none was exceeded."
+
+
+def _certified(summary: CampaignSummary) -> int:
+    """Return the number of grid points with a certified bound."""
+    return sum(result.point.certified_error is not None for result in summary.results)
 
 
 def _reference(summary: CampaignSummary) -> str | None:

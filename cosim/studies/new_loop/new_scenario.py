@@ -25,7 +25,7 @@ import numpy as np
 from cosim.analysis.certificates import Certificates, certificates_of
 from cosim.analysis.claims.run_certificates import RUN_WORK
 from cosim.analysis.scenario_certificates import quick_certificate
-from cosim.output.guarantee_sentence import guarantee_sentence
+from cosim.output.guarantee_sentence import guarantee_sentence, is_within_allowed
 from cosim.output.run_verdict import SETTLED_SHARE
 from cosim.record.run_directory import refuse_among_results
 from cosim.simulation.virtual_time import simulate_loops
@@ -64,6 +64,8 @@ from noack.theory.trigger_norm import input_norm
 from noack.theory.witnesses.effort import MOST_WORK
 from noack.trigger_policies.decaying import DecayingSettings
 
+_POLICY = "decaying"
+"""The rule whose threshold is chosen."""
 _FLOOR_SHARE = 0.05
 """The floor of the threshold, as a share of beta."""
 _LARGEST_FLOOR_SHARE = 0.5
@@ -223,6 +225,11 @@ def new(
         NoackError: the plant does not rest at x = 0, u = 0, or a value is wrong.
     """
     values = dict(given_settings(settings))
+    if (policy := values.get("trigger.policy", _POLICY)) != _POLICY:
+        raise CallerError(
+            f'trigger.policy = {policy}: noack new chooses a threshold, of policy "{_POLICY}"; give another '
+            f"rule as a whole table: --set 'trigger={{policy=\"{policy}\", ...}}'"
+        )
     if network is not None:
         values = {"network": _network(Path(network), Path(path)), **values}
     plant_model = plant if isinstance(plant, LinearModel | LoopGain) else model_or_gain(plant, values)
@@ -244,10 +251,14 @@ def new(
             break
         best = replace(best, x0=best.x0 * _START_FACTOR)
         returns = trials.returns(best)
+    simulated = best
     best, results = trials.with_threshold(best, report)
+    if trials.content(best) != trials.content(simulated):  # another threshold, fewer losses, a longer horizon
+        report("simulating")
+        returns = trials.returns(best)
     guarantee, of_plant = _guarantee(results), results.guaranteed is not None
     certificate = trials.certify(best)
-    notes = tuple(_notes(best, certificate, returns, of_plant=of_plant))
+    notes = (*_note_of_bounds(results, best.x0), *_notes(best, certificate, returns, of_plant=of_plant))
     if not isinstance(plant_model, LoopGain):
         notes += tuple(_note_of_input(best))
     text = _file_text(trials.content(best), (f"{guarantee}.", *notes), best, fixed)
@@ -258,7 +269,28 @@ def new(
 def _guarantee(results: Certificates) -> str:
     """Return the sentence of ``noack certify`` about the plant itself."""
     sentence = guarantee_sentence(results)
-    return f"no guarantee: {results.answer.text}" if sentence is None else sentence
+    if sentence is None:
+        return f"no guarantee: {results.answer.text}"
+    return sentence if is_within_allowed(results) else f"no guarantee of the allowed error: {sentence}"
+
+
+def _note_of_bounds(results: Certificates, start: Vector) -> Iterator[str]:
+    """Yield of each output whose proven bound is larger than its allowed error what this means."""
+    certificate = results.guaranteed
+    for bound in () if certificate is None else results.output_bounds(certificate):
+        output, first = bound.output, abs(float(np.array(bound.output.row)[: len(start)] @ start))
+        if bound.is_met:
+            continue
+        least = output.quantity(f"{bound.ultimate:.3g}")
+        if bound.ultimate >= first:
+            yield (
+                f"The proven bound of {output.name}, {least}, is not smaller than its value at the start, "
+                f"{output.quantity(f'{first:.3g}')}: it says only that {output.name} stays bounded."
+            )
+        yield (
+            f"For a smaller bound of {output.name}, choose a slower gain (noack gain --r), fewer losses "
+            "(--set network.mansd) or a smaller x(0) (--x0)."
+        )
 
 
 def _allowed(model: LinearModel, given: Mapping[str, float] | None) -> Mapping[str, float]:
@@ -468,7 +500,7 @@ class _TrialScenarios:
             },
             "controller": {"rate_hz": trial.rate_hz},
             "trigger": {
-                "policy": "decaying",
+                "policy": _POLICY,
                 "beta": beta,
                 "alpha_per_s": alpha,
                 "floor": self._first_floor(trial, beta) if trial.floor is None else trial.floor,

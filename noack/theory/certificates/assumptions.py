@@ -19,6 +19,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import NetworkConditions, network_delay_text
 from noack.theory.certificates.normal_values import normal_limit
 
+_OF_THEOREM_2, _OF_CERTIFICATES = "Theorem 2", "certificates"
 _NOT_COVERED = "not covered by the theorems and the certificates"
 _NOT_BY_THEOREMS = "not covered by the theorems"
 LINEAR_PLANT = "the plant is ẋ = Ax + Bu"
@@ -43,12 +44,30 @@ class Assumption(NamedTuple):
 
     what: str
     source: str
-    """The place in the paper."""
+    """The place in the paper, or what assumes it."""
     verdict: AssumptionStatus
     why: str
 
 
 def assumptions(resolved: Scenario) -> list[Assumption]:
+    """Return what is assumed of a resolved scenario, with verdicts.
+
+    With ``certificate.paper`` these are the paper's assumptions, else those of the guarantee and of
+    certificates.
+    """
+    if resolved.certificate.paper:
+        return paper_assumptions(resolved)
+    whole_loop, linear = loop_of(resolved), resolved.coverage.is_linear
+    loop = whole_loop.without_loads
+    checked = [_closed_loop(loop)] if linear else _not_linear(loop, resolved)[1:]
+    if linear and resolved.coverage.is_decaying:
+        checked.append(_decay_rate(loop, resolved.decaying.alpha_per_s))
+    of_certificates = [each._replace(source=_OF_CERTIFICATES) for each in checked]
+    guarantee = _mansd(resolved)._replace(source="guarantee")
+    return [*of_certificates, guarantee, *_estimated(whole_loop, resolved)[1:]]
+
+
+def paper_assumptions(resolved: Scenario) -> list[Assumption]:
     """Return the paper's assumptions for a resolved scenario, with verdicts."""
     whole_loop, linear = loop_of(resolved), resolved.coverage.is_linear
     loop = whole_loop.without_loads
@@ -76,12 +95,13 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     return checked + _estimated(whole_loop, resolved)
 
 
-def violations_of_theorem_2(resolved: Scenario) -> list[str]:
-    """Return the assumptions of Theorem 2 that a resolved scenario violates, each as a line."""
+def violated_by_gain_or_threshold(resolved: Scenario) -> list[str]:
+    """Return which assumptions gain and threshold of a resolved scenario violate, each as a line."""
     return [
-        f"an assumption of Theorem 2 is violated: {assumption.what}: {assumption.why}"
+        f"assumption violated: {assumption.what}: {assumption.why}"
         for assumption in assumptions(resolved)
-        if assumption.verdict == AssumptionStatus.VIOLATED and assumption.source == "Theorem 2"
+        if assumption.verdict == AssumptionStatus.VIOLATED
+        and assumption.source in (_OF_THEOREM_2, _OF_CERTIFICATES)
     ]
 
 
@@ -103,7 +123,7 @@ def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     why = f"largest real part of an eigenvalue: {nominal:.3g} /s (Â + B̂K){_other_sign(loop)}"
     return [
         _violated(LINEAR_PLANT, "eq:plant", kind),
-        _checked("the gain stabilises the model", "Theorem 2", nominal < 0, why),
+        _checked("the gain stabilises the model", _OF_THEOREM_2, nominal < 0, why),
     ]
 
 
@@ -161,7 +181,7 @@ def _closed_loop(loop: LoopMatrices) -> Assumption:
     nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
     return _checked(
         "the gain stabilises the plant and the model",
-        "Theorem 2",
+        _OF_THEOREM_2,
         true < 0 and nominal < 0,
         f"largest real part of an eigenvalue: {true:.3g} /s (A + BK), {nominal:.3g} /s (Â + B̂K)"
         f"{_other_sign(loop)}",
@@ -178,7 +198,7 @@ def _decay_rate(loop: LoopMatrices, alpha_per_s: float) -> Assumption:
     rate = -spectral_abscissa(loop.A + loop.B @ loop.K)
     assumed = "0 < α < ᾱ: the threshold decays more slowly than the closed loop"
     why = f"α = {alpha_per_s:g} /s; A + BK: {_decays(rate)}"
-    return _checked(assumed, "Theorem 2", alpha_per_s < rate, why)
+    return _checked(assumed, _OF_THEOREM_2, alpha_per_s < rate, why)
 
 
 def _decays(rate_per_s: float) -> str:

@@ -246,6 +246,51 @@ def test_a_guarantee_is_kept_if_nothing_is_proven_with_a_larger_threshold(
     assert made.scenario.trigger.floor != tried[1].floor
 
 
+def test_the_written_settings_are_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Proofs change the threshold after the first simulation; what is said is about the last one."""
+    Path("servo.py").write_text(SERVO)
+    returns, simulated = _TrialScenarios.returns, list[noack.Scenario]()
+
+    def noted(trials: _TrialScenarios, trial: _Trial) -> bool:
+        simulated.append(trials.scenario(trial))
+        returns(trials, trial)
+        return len(simulated) == 1
+
+    monkeypatch.setattr(_TrialScenarios, "returns", noted)
+    made = noack.new("servo.py", "servo.toml")
+    assert simulated[-1] == made.scenario != simulated[0]
+    assert any("the loop does not return to 0" in note for note in made.notes)
+
+
+CLIPPED = """
+import numpy as np
+
+class Drive:
+    states = ["speed, rad/s", "current, A"]
+    inputs = ["voltage, V"]
+    allowed = {"speed": 5.0}
+    initial_state = [50.0, 0.0]
+
+    def derivative(self, t_s, z, u):
+        w, i = z
+        v = np.clip(u[0], -24.0, 24.0)
+        return (0.05 * i - 1e-4 * w) / 2e-4, (v - 0.5 * i - 0.05 * w) / 1e-3
+"""
+
+
+def test_a_bound_that_says_only_that_the_loop_stays_bounded_is_called_so() -> None:
+    Path("drive.py").write_text(CLIPPED)
+    made = noack.new("drive.py", "drive.toml")
+    assert made.guarantee.startswith("no guarantee of the allowed error: speed stays within ")
+    assert "in the end, not within 5 rad/s" in made.guarantee
+    assert made.notes[0].endswith("50 rad/s: it says only that speed stays bounded.")
+
+
+def test_another_rule_is_given_as_a_whole_table() -> None:
+    made = noack.new("unstable_pendulum", settings={"trigger": {"policy": "periodic", "period_s": 0.01}})
+    assert made.scenario.trigger.policy == "periodic"
+
+
 def test_dry_friction_is_left_out_of_the_model_and_kept_in_the_guarantee() -> None:
     """Its tanh is steep for the speeds of the loop; the class of the readme uses math."""
     (code,) = blocks("README.md", "python")
