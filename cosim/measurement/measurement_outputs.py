@@ -83,15 +83,14 @@ def measurement_document(measurement: NetworkMeasurement, void: CertificateTime 
         kind="network measured",
         data=measurement.to_json() | ({} if void is None else {"certificate": void.to_json()}),
         blocks=[
-            Sentence(text=measurement.name, on_page=False),
-            *measurement_figures(measurement),
-            *measurement_tables(measurement, void),
-            Sentence(text=f"M = {longest + 1}{also}", role=SentenceRole.VERDICT, on_terminal=False),
+            Sentence(text=f"M = {longest + 1}{also}", role=SentenceRole.VERDICT, lead=f"{measurement.name}:"),
             Sentence(
                 text=f"{where} most M − 1 = {longest} consecutive packets were not effectively delivered.",
                 role=SentenceRole.REMARK,
-                on_terminal=False,
+                is_prose=True,
             ),
+            *measurement_figures(measurement),
+            *measurement_tables(measurement, void),
             *(Sentence(text=line, role=SentenceRole.REMARK, is_prose=True) for line in remarks),
         ],
     )
@@ -192,6 +191,9 @@ def _numbers(measurement: NetworkMeasurement, suffix: str) -> Iterator[tuple[str
     if delays.received:
         values = (duration(delays.quantiles_s[share]) for share in _SHOWN_DELAYS)
         yield f"delay {' / '.join(_SHOWN_DELAYS.values())}", " / ".join(values)
+    if delays.jitter is not None:
+        last, largest = (duration(value) for value in delays.jitter)
+        yield "jitter by RFC 3550, last / max", f"{last} / {largest}"
     if delays.correlation.lags:
         yield "correlation of successive delays", f"{delays.correlation.at_lags[0]:.2f}"
 
@@ -289,8 +291,8 @@ def measurement_figures(measurement: NetworkMeasurement) -> Iterator[PageFigure]
         _HEIGHT_IN,
         lambda axes: _draw_correlation(axes, measurement),
         caption="Correlation of the delays (of their normal scores) and of the effective losses of "
-        f"two packets, by their distance. Within the dashed lines: {100 * LEVEL:.0f} % of the "
-        "correlations of independent delays.",
+        "two packets, by their distance, without outages. Within the dashed lines: "
+        f"{100 * LEVEL:.0f} % of the correlations of independent delays.",
         description="Curves: correlation of delays and of losses over the distance in packets.",
     )
     yield one_panel(

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 from scipy.special import ndtri
 
 from cosim.measurement.certificate_time import CertificateTime, certificate_time
@@ -78,10 +79,36 @@ class DelayStatistics:
     """Of the delays of two packets. The emulator's ``delay … CORRELATION`` is that at lag 1."""
     white_noise_limit: float
     """Size below which 95 % of the correlations of independent delays are."""
+    jitter: "Jitter | None" = None
 
 
-def delay_statistics(trace: PacketTrace) -> DelayStatistics:
-    """Return the statistics of the packets that were received, in order or not."""
+class Jitter(NamedTuple):
+    """The interarrival jitter of RFC 3550, Section 6.4.1, in seconds."""
+
+    last_s: float
+    """After the last packet."""
+    largest_s: float
+
+
+def interarrival_jitter(trace: PacketTrace) -> Jitter | None:
+    """Return the jitter J, with J ← J + (|D| − J)/16 for the difference D of two packets' delays.
+
+    The packets are those received, in the order of their arrival. With fewer than two there is none.
+    """
+    arrived = np.flatnonzero(~trace.lost)
+    order = arrived[np.argsort(trace.received_ns[arrived], kind="stable")]
+    differences = np.abs(np.diff(trace.delay_ns[order])).astype(np.float64)
+    if not len(differences):
+        return None
+    jitter_ns = lfilter([1 / 16], [1, -15 / 16], differences)
+    return Jitter(float(jitter_ns[-1]) * 1e-9, float(jitter_ns.max()) * 1e-9)
+
+
+def delay_statistics(trace: PacketTrace, in_outage: Flags) -> DelayStatistics:
+    """Return the statistics of the packets that were received, in order or not.
+
+    The correlation is that of packets that are not in an outage, (k,) flags.
+    """
     arrived = ~trace.lost & (trace.delays_unknown == "")
     delays_ns = trace.delay_ns[arrived]
     if not len(delays_ns):
@@ -90,8 +117,9 @@ def delay_statistics(trace: PacketTrace) -> DelayStatistics:
     return DelayStatistics(
         len(delays_ns),
         dict(zip(SHARES, quantiles.tolist(), strict=True)),
-        autocorrelation(trace.delay_ns, arrived),
+        autocorrelation(trace.delay_ns, arrived & ~in_outage),
         1.96 / np.sqrt(len(delays_ns)),
+        interarrival_jitter(trace),
     )
 
 
@@ -254,13 +282,21 @@ class NetworkMeasurement:
     @cached_property
     def delays(self) -> DelayStatistics:
         """Delays of the received packets."""
-        return delay_statistics(self.trace)
+        return delay_statistics(self.trace, self.in_outage)
+
+    @cached_property
+    def in_outage(self) -> Flags:
+        """(k,) Which packets belong to an outage."""
+        outages = self.bursts.subset(self.is_outage)
+        steps = np.zeros(len(self.trace) + 1, np.int64)
+        steps[outages.first] += 1
+        steps[outages.end] -= 1
+        return np.cumsum(steps)[:-1] > 0
 
     @cached_property
     def loss_correlation(self) -> Correlation:
-        """The correlation of the effective losses of two packets."""
-        all_known = np.ones(len(self.trace), bool)
-        return autocorrelation(self.outcomes.effective.astype(np.int64), all_known)
+        """The correlation of the effective losses of two packets that are not in an outage."""
+        return autocorrelation(self.outcomes.effective.astype(np.int64), ~self.in_outage)
 
     @cached_property
     def _fits(self) -> ChainFits:
@@ -374,6 +410,7 @@ class NetworkMeasurement:
             "delay_correlation": dict(
                 zip(map(str, self.delays.correlation.lags), self.delays.correlation.at_lags, strict=True)
             ),
+            "jitter_s": None if self.delays.jitter is None else self.delays.jitter._asdict(),
             "interval_level": LEVEL,
             "models": {name: model.to_json() for name, model in self.models.items()},
             "chosen_model": self.chosen.fit.model if self.models else None,

@@ -4,7 +4,7 @@
   clocks differ, unless the user says otherwise.
 * One capture with both ends, such as a host that forwards writes: the same, with one clock.
 * One capture of the receiver's end: numbers at a known place of the payload, for a sender with a
-  fixed period.
+  fixed period, or a stream of RTP, whose timestamps say when its packets were sent.
 
 A flow is a pair of addresses on a leg: an interface, with the VLAN and the direction. The largest is
 taken, unless the user names another. A datagram that a capture does not show as it was sent (cut, merged,
@@ -34,10 +34,12 @@ from noack.traces.packet_trace import (
     packet_trace,
     relative_delays,
 )
+from noack.traces.rtp_stream import RtpStream, find_rtp, plan_by_timestamps
 from noack.traces.sending_plan import plan_sending
 
 _NEAR_END = 100
 """Arrivals by whose delays it is decided what the receiver's capture would show."""
+_RTP_NUMBERS = SequenceField(2, 2, False)
 MOST_UNKNOWN = 0.01
 """Largest share of packets that may have been lost by the capture, or that it does not show as sent."""
 
@@ -99,19 +101,21 @@ def read_captures(files: Sequence[IO[bytes]], options: CaptureOptions) -> Packet
 
 def _trace(captures: list[Capture], flow: CapturedFlow, options: CaptureOptions) -> PacketTrace:
     field = options.sequence_at
+    stream = None
+    if len(captures) == 1 and field in (None, _RTP_NUMBERS):
+        stream = find_rtp(captures[0], flow)
     if len(captures) > 1:
         if field is not None:
             raise ValueError("--sequence-at needs the receiver's capture only")
         ends: _Ends | None = _two_captures(captures[0], flow, captures[1], options)
-    elif field is not None and options.far_flow == options.flow:
+    elif (field or stream) and options.far_flow == options.flow:
         ends = None
     else:
-        ends = _one_capture(captures[0], flow, options, is_numbered=field is not None)
+        ends = _one_capture(captures[0], flow, options, field, is_numbered=bool(field or stream))
     if ends is None:
-        assert field is not None
         if options.clocks_differ is not None:
             raise ValueError("--clocks: has no effect on one end, whose capture has no sending times")
-        return _trace_of_numbers(captures[0], flow, field, options.most_packets)
+        return _trace_of_numbers(captures[0], flow, field or _RTP_NUMBERS, stream, options.most_packets)
     return _trace_of_ends(ends, field, options.most_packets)
 
 
@@ -143,7 +147,12 @@ def _two_captures(sender: Capture, flow: CapturedFlow, receiver: Capture, option
 
 
 def _one_capture(
-    capture: Capture, flow: CapturedFlow, options: CaptureOptions, *, is_numbered: bool
+    capture: Capture,
+    flow: CapturedFlow,
+    options: CaptureOptions,
+    field: SequenceField | None,
+    *,
+    is_numbered: bool,
 ) -> _Ends | None:
     """Return the datagrams at the two ends in one capture; None: it has one end, and numbers."""
     capture.show(capture.shown_bytes)
@@ -190,7 +199,7 @@ def _one_capture(
     if flow.is_copy_of(capture.flows[other]):
         capture.notes.append("both legs have the same direction: between them is no network, only this host")
     theirs = others.where(others.flow == other)
-    if is_numbered:
+    if field is not None:
         capture.notes.append(
             "the capture has both ends: sending times are those of the first one, and numbers that are "
             "missing there count as lost; to measure one flow alone by its numbers, give its number as "
@@ -297,8 +306,10 @@ def _common_time(ends: _Ends, arrived: Int64s, arrived_ns: Int64s) -> tuple[int,
     usually_ns = int(np.quantile(lag_ns[-_NEAR_END:], 0.99))
     begin = min(int(np.searchsorted(sent_ns, span.begin_ns - soonest_ns)), int(arrived[0]))
     end_ns = span.end_ns
-    if ends.sender is ends.receiver and 4 * usually_ns < (period_ns := int(np.median(np.diff(sent_ns)))):
-        end_ns += period_ns // 4  # hardly a datagram is on its way
+    if ends.sender is ends.receiver and len(sent_ns) > 1:
+        period_ns = int(np.median(np.diff(sent_ns)))
+        if 4 * usually_ns < period_ns:
+            end_ns += period_ns // 4  # hardly a datagram is on its way
     end = max(int(np.searchsorted(sent_ns, end_ns - usually_ns, side="right")), int(arrived[-1]) + 1)
     if begin:
         notes.append(f"datagrams left out because the receiver's capture begins after them: {begin}")
@@ -401,15 +412,15 @@ def _check_dropped(capture: Capture, received: Datagrams, trace: PacketTrace) ->
 
 
 def _trace_of_numbers(
-    capture: Capture, flow: CapturedFlow, field: SequenceField, most_packets: int
+    capture: Capture, flow: CapturedFlow, field: SequenceField, stream: RtpStream | None, most_packets: int
 ) -> PacketTrace:
-    """Return the trace of a sender with a constant period; the payloads have a number each."""
+    """Return the trace of a sender with a constant period, or of RTP; the payloads have a number each."""
     if flow.leg.outbound:
         everything, number = capture.datagrams, capture.flows.index(flow)
         others = everything.where(everything.flow != number)
         received, _ = matches(everything.where(everything.flow == number), others)
         _refuse_senders_end(capture.flows[k] for k in np.unique(others.flow[received]))
-    numbered = number_packets(capture, flow, field)
+    numbered = number_packets(capture, flow, field, None if stream is None else stream.row)
     capture.note_merged(capture.flows.index(flow))
     count = int(numbered.packet.max()) + 1
     if count > most_packets:
@@ -417,9 +428,12 @@ def _trace_of_numbers(
             f"the sequence numbers span {count} packets; at most {most_packets} can be; check --sequence-at"
         )
     order = np.argsort(numbered.packet, kind="stable")
-    packet, part, received_ns = (column[order] for column in numbered[:3])
+    packet, part, received_ns, row = (column[order] for column in numbered[:4])
     received_ns = received_ns - received_ns.min()
-    sent_ns, unknown = _planned_times(capture, packet, part, received_ns)
+    if stream is None:
+        sent_ns, unknown = _planned_times(capture, packet, part, received_ns)
+    else:
+        sent_ns, unknown = _times_of_stream(capture, stream, packet, row, part, received_ns)
     trace = packet_trace(
         sent_ns,
         np.maximum(received_ns, sent_ns),
@@ -451,11 +465,60 @@ def _planned_times(capture: Capture, packet: Int64s, part: Int64s, received_ns: 
             capture.notes.append(planned.note)
     if unknown:
         capture.notes.append(f"the capture has no sending times, and delays are not known: {unknown}")
-        return np.minimum.accumulate(received_ns[::-1])[::-1], unknown
+        return _times_of_arrivals(packet, received_ns), unknown
     periods = ", ".join(dict.fromkeys(f"{period_ns / 1e6:.6g}" for period_ns in periods_ns))
     capture.notes.append(
         "the capture has no sending times: by the arrivals, the sender's period is constant, "
         f"{periods} ms; the smallest delay is shown as 0, and a deadline applies to these relative delays"
+    )
+    return np.maximum.accumulate(sent_ns), ""
+
+
+def _times_of_arrivals(packet: Int64s, received_ns: Int64s) -> Int64s:
+    """Return sending times for packets in the order of their numbers, without delays.
+
+    They are the arrivals of those that arrived before all later ones, and between them on a line.
+    """
+    soonest_ns = np.minimum.accumulate(received_ns[::-1])[::-1]
+    in_order = np.flatnonzero(received_ns == soonest_ns)
+    in_order = in_order[np.append(np.diff(received_ns[in_order]) > 0, True)]
+    known, at_ns = packet[in_order], received_ns[in_order]
+    period_ns = (at_ns[-1] - at_ns[0]) // max(int(known[-1] - known[0]), 1)
+    before_ns = at_ns[0] - (known[0] - packet[: in_order[0]]) * period_ns
+    after_ns = np.rint(np.interp(packet[in_order[0] :], known, at_ns - at_ns[0])).astype(np.int64)
+    return np.concatenate((before_ns, at_ns[0] + after_ns))
+
+
+def _times_of_stream(
+    capture: Capture,
+    stream: RtpStream,
+    packet: Int64s,
+    row: Int64s,
+    part: Int64s,
+    received_ns: Int64s,
+) -> tuple[Int64s, str]:
+    """Return the sending times by the timestamps, below all arrivals, and why delays are not known."""
+    sent_ns = np.zeros(len(row), np.int64)
+    rates_hz: list[float] = []
+    unknown = ""
+    for here in (part == k for k in np.unique(part)):
+        planned, rate_hz = plan_by_timestamps(stream.ticks_of(row[here]), received_ns[here])
+        sent_ns[here] = planned.sent_ns
+        rates_hz.append(rate_hz)
+        unknown = unknown or planned.unknown
+    rates = ", ".join(dict.fromkeys(f"{rate_hz:.6g}" for rate_hz in rates_hz))
+    capture.notes.append(
+        f"a stream of RTP: source (SSRC) 0x{stream.source:08x}, payload type {stream.payload_type}, "
+        f"timestamps of {rates} Hz"
+    )
+    if stream.others:
+        capture.notes.append(f"datagrams left out because they are not of this source: {stream.others}")
+    if unknown:
+        capture.notes.append(f"the delays are not known: {unknown}")
+        return _times_of_arrivals(packet, received_ns), unknown
+    capture.notes.append(
+        "sending times are those of the timestamps; the smallest delay is shown as 0, and a deadline applies "
+        "to these relative delays"
     )
     return np.maximum.accumulate(sent_ns), ""
 

@@ -13,6 +13,7 @@ from noack.traces.captured_flows import Capture
 from noack.traces.merged_datagrams import pieces_of
 from noack.traces.packet_trace import Int64s
 from noack.traces.sequence_numbers import Arrivals, find_packets, nearest_steps
+from noack.traces.smallest_delays import FEWEST
 
 _FIELD = re.compile(r"([0-9]{1,5}):([1-8])(:little)?")
 _MOST_UNREADABLE = 0.01
@@ -30,6 +31,8 @@ _MOST_MISSING = 0.9
 """Share of missing numbers between packets above which others have them: the counter is shared."""
 _RANGE = re.compile(r"([0-9]{1,20})\.\.([0-9]{1,20})")
 _MOST_NUMBERS = 2**62
+_MOST_OF_OTHER_SESSIONS = 0.05
+"""Share of the datagrams that short sessions may have, to be left out."""
 
 
 class SequenceField(NamedTuple):
@@ -130,15 +133,24 @@ class _Numbers(NamedTuple):
     row: Int64s
 
 
-def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -> NumberedPackets:
+def number_packets(
+    capture: Capture, flow: CapturedFlow, field: SequenceField, rows: Int64s | None = None
+) -> NumberedPackets:
     """Return the packets of a flow, and note what is unusual about its numbers.
+
+    Args:
+        capture: the capture.
+        flow: the flow.
+        field: where the numbers are.
+        rows: the datagrams, by their places in the file; None: all of the flow.
 
     Raises:
         ValueError: there are no sequence numbers, or too many datagrams are cut before them.
     """
-    numbers = _read_numbers(capture, flow, field)
+    numbers = _read_numbers(capture, flow, field, rows)
     if len(numbers.number) < 2:
         raise ValueError(f"fewer than two datagrams have a sequence number at {field}")
+    numbers = _without_end(capture, numbers, field)
     _check_steps(capture, numbers, field)
     try:
         found = find_packets(numbers.number, numbers.t_ns, field.bits, field.size)
@@ -150,6 +162,7 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
     strays = len(numbers.number) - len(found.arrival)
     if strays:
         notes.append(f"datagrams left out because their number does not belong to the sequence: {strays}")
+    found = _without_short_parts(capture, found)
     packet = found.packet.copy()
     start = 0
     for part in range(int(found.part[-1]) + 1):
@@ -172,6 +185,47 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
     ambiguous = _ambiguity(numbered, found, field)
     notes.append(ambiguous)
     return numbered._replace(ambiguous=ambiguous)
+
+
+def _without_end(capture: Capture, numbers: _Numbers, field: SequenceField) -> _Numbers:
+    """Return numbers in which a negative one at the end (iperf2) is positive, and not repeated."""
+    number = numbers.number
+    last = int(number[-1])
+    first = len(number) - int(np.argmin(np.append(number[::-1] == last, False)))
+    ended = field.size - last
+    if field.low_bits or field.last is not None or first == 0:
+        return numbers
+    step = ended - int(number[first - 1])
+    if not 0 < step <= _MOST_LOST_BETWEEN or not ended < last:
+        return numbers
+    repeats = len(number) - first - 1
+    capture.notes.append(
+        f"the number at the end is negative, as iperf2 ends a stream: it counts as {ended}"
+        f"{f', once; it is repeated {repeats} times' if repeats else ''}"
+    )
+    number = number.copy()
+    number[first] = ended
+    return _Numbers(*(column[: first + 1] for column in (number, *numbers[1:])))
+
+
+def _without_short_parts(capture: Capture, found: Arrivals) -> Arrivals:
+    """Return the arrivals without those of sessions that are too short to be measured beside the others."""
+    sizes = np.bincount(found.part)
+    is_short = sizes < FEWEST
+    short = int(sizes[is_short].sum())
+    if not 0 < short <= _MOST_OF_OTHER_SESSIONS * len(found.part):
+        return found
+    capture.notes.append(f"datagrams left out because they belong to another, short session: {short}")
+    kept = ~is_short[found.part]
+    places = np.cumsum(kept) - 1
+    return found._replace(
+        arrival=found.arrival[kept],
+        packet=found.packet[kept],
+        part=(np.cumsum(~is_short) - 1)[found.part[kept]],
+        uncertain=tuple(
+            gap._replace(place=int(places[gap.place])) for gap in found.uncertain if kept[gap.place]
+        ),
+    )
 
 
 def _ambiguity(numbered: NumberedPackets, found: Arrivals, field: SequenceField) -> str:
@@ -255,13 +309,16 @@ def _check_steps(capture: Capture, numbers: _Numbers, field: SequenceField) -> N
         )
 
 
-def _read_numbers(capture: Capture, flow: CapturedFlow, field: SequenceField) -> _Numbers:
+def _read_numbers(
+    capture: Capture, flow: CapturedFlow, field: SequenceField, rows: Int64s | None = None
+) -> _Numbers:
     """Return the numbers of a flow in the order of arrival, merged datagrams divided."""
     longest: list[tuple[int, int, bytes]] = []
     numbers, columns = array("Q"), (array("q"), array("q"))
     cut = short = outside = 0
+    chosen = None if rows is None else frozenset(rows.tolist())
     for row, datagram in enumerate(capture.read()):
-        if datagram.flow != flow:
+        if datagram.flow != flow or (chosen is not None and row not in chosen):
             continue
         number = field.read(datagram.payload)
         if number is None:

@@ -107,7 +107,7 @@ def find_packets(number: NDArray[np.uint64], t_ns: Int64s, bits: int, size: int 
         period_ns = _period_of_all(steps, t_ns)
     else:
         period_ns = _rough_period(steps, t_ns, size)
-    strays = _strays(steps, period_ns)
+    strays = _strays(steps, period_ns) | _strays_at_ends(steps, t_ns, period_ns)
     if strays.any():
         index, t_ns = index[~strays], t_ns[~strays]
         steps = nearest_steps(number[~strays], size)
@@ -134,6 +134,24 @@ def _strays(steps: Int64s, period_ns: float) -> NDArray[np.bool_]:
         here = slice(max(i - _NEIGHBOURS, 0), i + _NEIGHBOURS)
         others = packet[here][~strays[here]]
         strays[i] = not others.min() <= packet[i] <= others.max()
+    return strays
+
+
+def _strays_at_ends(steps: Int64s, t_ns: Int64s, period_ns: float) -> NDArray[np.bool_]:
+    """Return which of the first and last numbers are far from all others: those of another session.
+
+    Of more of them, a restart of the sender is noticed.
+    """
+    strays = np.zeros(len(steps) + 1, bool)
+    ahead = steps.astype(float) - np.diff(t_ns) / period_ns
+    far = (np.abs(ahead) > _FAR_AHEAD_NS / period_ns) & (np.abs(steps) > _FAR_BACK)
+    jumps = np.flatnonzero(far)
+    before = jumps[jumps < _FEWEST_AFTER_RESTART - 1]
+    behind = jumps[jumps > len(steps) - _FEWEST_AFTER_RESTART]
+    if len(before) == 1 and len(steps) > 2 * _FEWEST_AFTER_RESTART:
+        strays[: before[0] + 1] = True
+    if len(behind) == 1 and len(steps) > 2 * _FEWEST_AFTER_RESTART:
+        strays[behind[0] + 1 :] = True
     return strays
 
 
