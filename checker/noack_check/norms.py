@@ -63,10 +63,7 @@ def decays_below(G: arb_mat, bound: arb, tail: arb_mat) -> bool:
 
 
 def lyapunov_function(F: arb_mat, Q: arb_mat) -> arb_mat | None:
-    """Return P ≻ 0 with FᵀP + PF = −Q, (n, n); None if it is not proven that there is one.
-
-    noack has the same one up to rounding.
-    """
+    """Return P ≻ 0 with FᵀP + PF = −Q, (n, n); None if it is not proven that there is one."""
     n = F.nrows()
     every = [(i, j) for i in range(n) for j in range(n)]
     equations = arb_mat(

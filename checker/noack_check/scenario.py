@@ -8,7 +8,6 @@ refuses has no loop. A reference, or a set-point, which is a constant one, is mo
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
-from functools import lru_cache
 from typing import NamedTuple, Required, TypedDict
 
 from flint import arb, arb_mat, fmpq
@@ -27,7 +26,6 @@ from noack_check.balls import (
 )
 from noack_check.document import read_table
 from noack_check.equations import LinearPlants, enclose, read_region
-from noack_check.kalman import KalmanFilter
 from noack_check.keys import RefusedError, Table, refusals
 from noack_check.loop import Along, Loop, Memory, Observer, Region, Rule, Times
 from noack_check.norms import lyapunov_function, spectral_norm
@@ -37,6 +35,7 @@ from noack_check.times import NS_PER_S, Schedule, fraction, nanoseconds, nearest
 Rows = Sequence[Sequence[float]]
 _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
 """Kinds of impairments that do not change the delay of an update."""
+_MOST_GAINS = 1000
 
 
 class _Plants(NamedTuple):
@@ -694,12 +693,11 @@ def _compared(trigger: Table, weight: arb_mat, model: Table) -> Rule:
 def _dynamic(trigger: Table, n: int, model: Table) -> Rule:
     """Return Girard's rule: η + θw < 0 with w = σ xᵀQx − 2 xᵀPBK e_s and dη/dt = −λη + w.
 
-    P is that of the model's closed loop F: FᵀP + PF = −Q.
+    P is any symmetric matrix that the scenario states.
     """
-    A, B, K = (matrix(_matrix(model, f"model.{key}")) for key in ("A", "B", "gain"))
+    B = matrix(_matrix(model, "model.B"))
     Q = _symmetric(trigger, "trigger.Q", n) if "Q" in trigger else identity(n)
-    if (P := lyapunov_function(A + B * K, Q)) is None:
-        raise RefusedError("trigger.policy: the closed loop of the model is not stable")
+    P = _symmetric(trigger, "trigger.P", n)
     keys = ("sigma", "theta_s", "decay_per_s", "eta_0")
     sigma, theta, decay, start = (number(_real(trigger, f"trigger.{key}")) for key in keys)
     w = _blocks(sigma * Q, -1 * (P * B))
@@ -800,34 +798,25 @@ def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | No
     if len(estimate) != n:
         raise RefusedError(f"observer.initial_estimate: not {n} numbers")
     start = matrix([[value] for value in estimate]) - matrix([[value] for value in x_0])
-    if _choice(observer, "observer.kind", ("luenberger", "kalman")) == "kalman":
-        gains = _kalman_gains(resolved, plants.A, rows)
-    else:
-        names = ["first_gain", "gain"] if "first_gain" in observer else ["gain"]
-        gains = tuple(matrix(_matrix(observer, f"observer.{name}")) for name in names)
-        for name, gain in zip(names, gains, strict=True):
-            if (gain.nrows(), gain.ncols()) != (n, C.nrows()):
-                raise RefusedError(f"observer.{name}: not a row for each state, and a column for each output")
+    gains = tuple(matrix(rows) for rows in _gains(observer))
+    if any((gain.nrows(), gain.ncols()) != (n, C.nrows()) for gain in gains):
+        raise RefusedError("observer: a gain has not a row for each state, and a column for each output")
     return Observer(gains, C, start, fmpq(int(schedule.sample), NS_PER_S))
 
 
-def _kalman_gains(resolved: Table, A: Rows, C: Rows) -> tuple[arb_mat, ...]:
-    """Return the gains of the Kalman filter in the sensor; see :meth:`.kalman.KalmanFilter.gains`."""
-    observer, schedule = _table(resolved, "observer"), read_schedule(resolved)
-    std = _row(observer, "observer.initial_std")
-    noises = (_matrix(observer, f"observer.{key}") for key in ("Q", "R"))
-    A, C, Q, R = (tuple(map(tuple, M)) for M in (A, C, *noises))
-    return _gains_of(A, C, Q, R, tuple(std), int(schedule.step), int(schedule.sample / schedule.step))
-
-
-@lru_cache(maxsize=16)
-def _gains_of(
-    A: Rows, C: Rows, Q: Rows, R: Rows, std: Sequence[float], step_ns: int, steps: int
-) -> tuple[arb_mat, ...]:
-    """Return the gains; a search reads a scenario many times, so those of the last filters are kept."""
-    start = [[number(value) ** 2 * int(i == j) for j in range(len(std))] for i, value in enumerate(std)]
-    flow = (arb(fmpq(step_ns, NS_PER_S)) * matrix(A)).exp()
-    return KalmanFilter(flow, matrix(Q), steps, matrix(C), matrix(R), arb_mat(start)).gains()
+def _gains(observer: Table) -> list[Rows]:
+    """Return the observer's gains at the first measurements; the last one is that of all later ones."""
+    if _choice(observer, "observer.kind", ("luenberger", "kalman")) == "luenberger":
+        names = ["first_gain", "gain"] if "first_gain" in observer else ["gain"]
+        return [_matrix(observer, f"observer.{name}") for name in names]
+    if "gains" not in observer:
+        raise RefusedError(
+            "observer.gains: missing; noack check --resolved states them if they become constant"
+        )
+    gains = observer["gains"]
+    if not isinstance(gains, list) or not 0 < len(gains) <= _MOST_GAINS:
+        raise RefusedError(f"observer.gains: not from 1 to {_MOST_GAINS} matrices")
+    return [_matrix({"gains": gain}, "observer.gains") for gain in gains]
 
 
 def _require_unknown_start(resolved: Table, what: str) -> None:

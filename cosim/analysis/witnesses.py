@@ -8,7 +8,6 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.core.progress import Progress, no_progress, part_of
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations, trace
-from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import with_stated_numbers
@@ -42,8 +40,6 @@ from noack_check.proof import Proof, prove
 from noack_check.scenario import Enclosed as EnclosedPlant
 from noack_check.scenario import read_loop
 
-_LATER_GAINS = 100
-"""So many gains are compared after an observer's gains became constant, but for rounding."""
 _NEAR = 1e-3
 """The equations near 0, in multiples of typical sizes: they tell searches for other plants apart."""
 
@@ -194,29 +190,12 @@ def find_statement(
             )
         else:
             loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal", longer=longer)
-            _require_gains(resolved, loop)
             witness = known_or_found(loop, progress, most_work, has_outputs=has_outputs, near=near)
         bounds = proven_bounds(witness.proof, loop)
     except (RefusedError, NoWitnessError, NotEnclosedError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
     return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds)
-
-
-def _require_gains(resolved: Scenario, loop: Loop) -> None:
-    """Require that the gains of the sensor's observer, in floats, are in the balls of those of the loop.
-
-    Raises:
-        NoWitnessError: rounding moves one of them by more.
-    """
-    if resolved.observer is None or loop.observer is None:
-        return
-    balls, own = loop.observer.gains, resolved.observer.gains(assumed_model(resolved))
-    for test, gain in enumerate(islice(own, len(balls) + _LATER_GAINS)):
-        ball = balls[min(test, len(balls) - 1)]
-        for known, value in zip(ball.entries(), gain.ravel().tolist(), strict=True):
-            if not known.contains(value):
-                raise NoWitnessError(f"observer: rounding moves its gain at measurement {test} by too much")
 
 
 def plant_on_regions(

@@ -111,7 +111,7 @@ class SampledLoop:
         assumed, measurements = assumed_model(resolved), self.last // self.steps_per_measurement + 1
         self._C, self._gains = assumed.C, np.zeros((0, n, len(assumed.C)))
         if resolved.observer is not None:
-            self._gains = _dense(np.array([*islice(resolved.observer.gains(assumed), measurements)]))
+            self._gains = _dense(np.array([*islice(resolved.observer.gains_of(assumed), measurements)]))
         loops = (_without_model(resolved),)
         self._machines = (plants_of(loops), sensors_of(loops), controllers_of(loops))
         self._set_disturbances(state_increments(resolved), noise_of(resolved))

@@ -76,7 +76,7 @@ static void load(noack_segments *segments, int64_t run) {
         copy(n, segments->y + run * n, sensor->observer->x);
         sensor->observer->t_ns =
             step < 0 ? -1 : time_of_tick_ns(&plant->machine, step - step % measure_every);
-        sensor->observer->is_corrected = step >= 0;
+        sensor->observer->corrections = step >= 0;
     }
     copy(n, segments->x_c + run * n, controller->x_c);
     controller->model_ns = t_ns;

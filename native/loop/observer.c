@@ -3,11 +3,13 @@
    Luenberger: x <- Ad x + Bd u at every step of the plant; at a measurement x <- x + L(y - C x).
    Kalman (1960): also P <- Ad P Ad' + Q; at a measurement S = C P C' + R, L = P C' S^-1, and, by
    Bucy and Joseph, P <- (I - L C) P (I - L C)' + L R L'. Thus P stays symmetric and positive
-   semidefinite for any rounding error of L. */
+   semidefinite for any L: for its rounding error, and for a gain that the settings state. */
 #include <math.h>
 #include <stdlib.h>
 
 #include "loop.h"
+
+enum { MOST_GAINS = 1 << 16 };
 
 static void swap_rows(int64_t columns, double *row, double *other) {
     for (int64_t k = 0; k < columns; k++) {
@@ -64,6 +66,11 @@ void noack_observer_gain(noack_observer *observer) {
     if (observer->kind != NOACK_KALMAN)
         return;
     int64_t n = observer->n, p = observer->p;
+    if (observer->gain_count > 0 && !observer->has_gap) {
+        int64_t number = min_of(observer->corrections, observer->gain_count - 1);
+        copy(n * p, observer->gains + number * n * p, observer->gain);
+        return;
+    }
     double *CP = observer->scratch, *S = CP + n * p;
     noack_multiply(p, n, n, observer->C, observer->P, 0, CP);
     noack_multiply(p, n, p, CP, observer->C, 1, S);
@@ -112,6 +119,7 @@ void noack_observer_correct(noack_observer *observer, const double *y) {
     correct_estimate(observer, observer->gain, y);
     if (observer->kind == NOACK_KALMAN)
         correct_covariance(observer);
+    observer->corrections++;
 }
 
 /* The inputs of steps that a missing measurement would have reported are unknown: the first known
@@ -125,12 +133,13 @@ void noack_observe(
     const double *inputs = message->vector + observer->p;
     for (int64_t before = steps; before > 0; before--)
         noack_observer_predict(observer, inputs + m * max_of(known - before, 0));
-    if (!observer->is_corrected && observer->first_gain != NULL)
+    observer->has_gap |= steps > known;
+    if (observer->corrections == 0 && observer->first_gain != NULL) {
         correct_estimate(observer, observer->first_gain, message->vector);
-    else
+        observer->corrections = 1;
+    } else
         noack_observer_correct(observer, message->vector);
     observer->t_ns = t_ns;
-    observer->is_corrected = 1;
 }
 
 /* How it is made. ------------------------------------------------------------------------------ */
@@ -143,6 +152,8 @@ static const char *check(const noack_observer *observer) {
     if (!is_between(NOACK_LUENBERGER, observer->kind, NOACK_KALMAN)
         || !is_between(-1, observer->t_ns, MESSAGE_TIMES_NS))
         return "an observer is of an unknown kind, or has a time out of range";
+    if (!is_between(0, observer->gain_count, MOST_GAINS))
+        return "an observer has too many gains";
     return NULL;
 }
 
@@ -159,13 +170,14 @@ noack_observer *noack_observer_new(const noack_observer *settings, const char **
         {&observer.C, p * n, NEEDED},
         {&observer.gain, n * p, is_kalman ? STATE : NEEDED},
         {&observer.first_gain, n * p, OPTIONAL},
+        {&observer.gains, observer.gain_count * n * p, observer.gain_count > 0 ? NEEDED : OPTIONAL},
         {&observer.Q, n * n, of_kalman},
         {&observer.R, p * p, of_kalman},
         {&observer.P, n * n, of_kalman},
         {&observer.x, n, STATE},
         {&observer.scratch, 3 * n * n + n * p + p * p + 2 * n + p, STATE},
     };
-    return with_arrays(&observer, sizeof observer, arrays, 10, "an observer lacks a matrix", wrong);
+    return with_arrays(&observer, sizeof observer, arrays, 11, "an observer lacks a matrix", wrong);
 }
 
 void noack_observer_free(noack_observer *observer) { free(observer); }

@@ -221,7 +221,8 @@ typedef struct {
 noack_plant *noack_plant_new(const noack_plant *settings, const char **wrong);
 void noack_plant_free(noack_plant *plant);
 
-/* The observer of a sensor. Luenberger: the gain is given. Kalman: it follows from P. */
+/* The observer of a sensor. Luenberger: the gain is given. Kalman: those of the first measurements are
+   given, the last one for all later ones, until a measurement is missing; else it follows from P. */
 typedef struct {
     int64_t kind;         /* enum noack_observer_kind */
     int64_t n, m, p;
@@ -230,9 +231,12 @@ typedef struct {
     double *Q, *R;        /* (n, n), (p, p) */
     double *gain;         /* (n, p); of a Kalman filter not to be given */
     double *first_gain;   /* (n, p) at the first measurement; NULL: gain */
+    double *gains;        /* (gain_count, n, p) of a Kalman filter; NULL: none is given */
+    int64_t gain_count;
     double *x, *P;        /* the state: (n,), (n, n) */
     int64_t t_ns;         /* time of the estimate; -1: that of the first measurement */
-    int64_t is_corrected; /* whether there was a measurement */
+    int64_t corrections;  /* measurements so far */
+    int64_t has_gap;      /* 1: a measurement was missing */
     double *scratch;      /* (3 n n + n p + p p + 2n + p,) */
 } noack_observer;
 

@@ -12,19 +12,32 @@ At a measurement::
     x̂ ← x̂ + L (y − C x̂)
     P ← (I − L C) P (I − L C)ᵀ + L R Lᵀ
 
-With this update P stays symmetric and positive semidefinite for any rounding error of L.
+With this update P stays symmetric and positive semidefinite for any L.
+
+While no measurement is missing, the sequence of gains is the same in all runs. So a resolved scenario states
+it, with a last gain for all later measurements, if the gains become constant: ``observer.gains``. The filter
+uses exactly these numbers, and so do certificates. From the first missing measurement on, L follows from P.
 """
 
 from collections.abc import Iterator
-from typing import ClassVar, Literal, Self
+from itertools import chain, islice, repeat
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from noack.core.core_library import core, pointer_to, reals_at
+from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
 from noack.settings.section import Deviations, MatrixRows, require_length, require_shape, rows_of
+
+_MOST_GAINS = 1000
+"""Gains that are not constant after so many measurements are not stated."""
+_CONSTANT = 1e-8
+"""Largest change of a constant gain from one measurement to the next, as a share of its largest entry."""
+_SAME = 1e-6
+"""Stated gains differ at most by this share from those that follow from the covariances."""
 
 
 class KalmanSettings(ObserverSettings):
@@ -53,6 +66,9 @@ class KalmanSettings(ObserverSettings):
     """Instead of noise_std: covariance of v, p x p."""
     initial_std: Deviations
     """Standard deviation of x − x̂ before the first measurement, n entries: P(0) = diag(·²)."""
+    gains: Annotated[tuple[MatrixRows, ...], Field(min_length=1, max_length=_MOST_GAINS)] | None = None
+    """L at the first measurements, n x p each; the last one holds for all later measurements. A resolved
+    scenario has them. They follow from the covariances, so leave them out."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -73,6 +89,8 @@ class KalmanSettings(ObserverSettings):
             require_length(getattr(self, key), f"observer.{key}", expected, f"one per {what}")
         require_shape(self.Q, "observer.Q", (n, n), "a covariance of states")
         require_shape(self.R, "observer.R", (p, p), "a covariance of outputs")
+        for gain in self.gains or ():
+            require_shape(gain, "observer.gains", (n, p), "one row per state, a column per output")
         _require_covariance("Q", self.Q, definite=False)
         _require_covariance("R", self.R, definite=True)
         output = noise.output if self.noise_std is None else self.noise_std
@@ -103,11 +121,6 @@ class KalmanSettings(ObserverSettings):
             R = np.diag(np.square(self.noise_std))
         return model._replace(Q=Q, R=R)
 
-    def stated(self, assumed: EstimationModel) -> Self:
-        Q, R = (rows_of((M + M.T) / 2) for M in (assumed.Q, assumed.R))
-        given = {"process_std": None, "input_std": None, "noise_std": None}
-        return self.model_copy(update={**given, "Q": Q, "R": R})
-
     def steady_gain(self, assumed: EstimationModel) -> Matrix | None:
         """Return L from the discrete algebraic Riccati equation; None if its solver fails."""
         # Imported here: a sensor does not need this large module.
@@ -120,9 +133,38 @@ class KalmanSettings(ObserverSettings):
             return None
         return np.asarray(np.linalg.solve(C @ predicted @ C.T + R, C @ predicted).T)
 
-    def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
+    def with_gains(self, assumed: EstimationModel) -> Self:
+        computed = self._constant_gains(assumed)
+        if self.gains is None:
+            gains = None if computed is None else tuple(map(rows_of, computed))
+            return self.model_copy(update={"gains": gains})
+        stated = np.array(self.gains)
+        expected = None if computed is None else computed[np.arange(len(stated)).clip(max=len(computed) - 1)]
+        if expected is None or np.abs(stated - expected).max() > _SAME * np.abs(expected).max():
+            raise CallerError(
+                "observer.gains: not those that follow from the model and the covariances; leave them out"
+            )
+        return self
+
+    def _constant_gains(self, assumed: EstimationModel) -> Matrix | None:
+        """Return the gains until they are constant, (k, n, p); None: they do not become constant."""
+        found = list[Matrix]()
+        for gain in islice(self._computed_gains(assumed), _MOST_GAINS):
+            found.append(gain)
+            if len(found) > 1 and np.abs(gain - found[-2]).max() <= _CONSTANT * np.abs(gain).max():
+                return np.array(found)
+        return None
+
+    def gains_of(self, assumed: EstimationModel) -> Iterator[Matrix]:
+        if self.gains is None:
+            return self._computed_gains(assumed)
+        stated = np.array(self.gains)
+        return chain(stated, repeat(stated[-1]))
+
+    def _computed_gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
+        """Yield the gains that follow from the covariances."""
         (n, m), p = assumed.Bd.shape, len(assumed.C)
-        observer = self.observer(assumed, {})
+        observer = self.model_copy(update={"gains": None}).observer(assumed, {})
         zeros = np.zeros(max(p, m))
         nothing = pointer_to(zeros, "double *")
         while True:
@@ -134,7 +176,9 @@ class KalmanSettings(ObserverSettings):
 
     def numbers(self, assumed: EstimationModel) -> dict[str, object]:
         covariances = {"P": np.diag(np.square(self.initial_std)), "Q": assumed.Q, "R": assumed.R}
-        return {"kind": core.NOACK_KALMAN} | covariances
+        stated = None if self.gains is None else np.array(self.gains)
+        gains = {"gains": stated, "gain_count": 0 if stated is None else len(stated)}
+        return {"kind": core.NOACK_KALMAN} | covariances | gains
 
 
 def _require_covariance(key: str, rows: MatrixRows | None, *, definite: bool) -> None:

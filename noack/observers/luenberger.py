@@ -84,7 +84,7 @@ class LuenbergerSettings(ObserverSettings):
     def steady_gain(self, assumed: EstimationModel) -> Matrix:
         return np.array(self.gain)
 
-    def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
+    def gains_of(self, assumed: EstimationModel) -> Iterator[Matrix]:
         gain = np.array(self.gain)
         return chain([gain if self.first_gain is None else np.array(self.first_gain)], repeat(gain))
 

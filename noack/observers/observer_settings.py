@@ -91,16 +91,20 @@ class ObserverSettings(ScenarioSection):
         """Return the model with the covariances that the observer assumes."""
         return model
 
-    def stated(self, assumed: EstimationModel) -> Self:
-        """Return settings with the covariances that the observer assumes, which depend on no other table."""
-        return self
-
     @abstractmethod
     def steady_gain(self, assumed: EstimationModel) -> Matrix | None:
         """Return L in the steady state, (n, p); None if none is found."""
 
+    def with_gains(self, assumed: EstimationModel) -> Self:
+        """Return settings with the gain of each measurement, if it is known before the run.
+
+        Raises:
+            CallerError: the settings state other gains.
+        """
+        return self
+
     @abstractmethod
-    def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
+    def gains_of(self, assumed: EstimationModel) -> Iterator[Matrix]:
         """Yield L of every measurement, (n, p), without end."""
 
     @abstractmethod

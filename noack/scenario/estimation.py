@@ -6,7 +6,6 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, discretise
 from noack.observers.observer_settings import EstimationModel
-from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 
 
@@ -24,11 +23,11 @@ class SteadyState(NamedTuple):
 
 def true_model(resolved: Scenario) -> EstimationModel:
     """The model with the covariances of the scenario's disturbances and noise."""
-    loop, plant = loop_of(resolved), resolved.plant
-    noise = plant.noise_variances(loop.n, loop.m)
-    Ad, Bd = discretise(loop.A_model, loop.B_model, float(resolved.timing.plant_period.exact))
-    _, Gd = discretise(loop.A_model, np.eye(loop.n), float(resolved.timing.plant_period.exact))
-    C = plant.measurement.matrix(loop.n)
+    (A, B), (n, m), plant = resolved.model.matrices, resolved.model.dimensions, resolved.plant
+    noise = plant.noise_variances(n, m)
+    Ad, Bd = discretise(A, B, float(resolved.timing.plant_period.exact))
+    _, Gd = discretise(A, np.eye(n), float(resolved.timing.plant_period.exact))
+    C = plant.measurement.matrix(n)
     model = EstimationModel(Ad, Bd, Gd, C, np.zeros_like(Ad), np.diag(noise.output), plant.measure_every)
     return model._replace(Q=model.process_covariance(noise.at_state, noise.at_input))
 

@@ -36,6 +36,7 @@ from noack.protocol.record_tables import (
 from noack.references.file import FilePiece
 from noack.references.segment import SolutionSegment
 from noack.scenario.controller_states import with_controller_states
+from noack.scenario.estimation import assumed_model
 from noack.scenario.loads import loaded_model, loaded_observer, loaded_plant, loaded_trigger
 from noack.scenario.outputs import LoopOutput
 from noack.scenario.overload import refuse_overload
@@ -281,6 +282,8 @@ def resolve_run(scenario: Scenario) -> ResolvedRun:
             sections.append(section)
             continue
         tables: dict[str, ScenarioSection | None] = {"model": loop.model, "observer": loop.observer}
+        if loop.trigger != given.trigger:
+            tables["trigger"] = loop.trigger
         if loop.controller.reference is not None:
             tables["controller"] = loop.controller
         update = {part: table.content() for part, table in tables.items() if table is not None}
@@ -344,7 +347,17 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
         loop.model_copy(update={**shared, "plant": own_plant})
         for loop, own_plant in zip(loops, cycle(plants), strict=False)
     ]
-    return [*map(with_controller_states, resolved)] if scenario.controller.states else resolved
+    resolved = [*map(with_controller_states, resolved)] if scenario.controller.states else resolved
+    computed = _computed_numbers(resolved[0])
+    return [loop.model_copy(update=computed) for loop in resolved]
+
+
+def _computed_numbers(resolved: Scenario) -> dict[str, object]:
+    """Return the tables with numbers that a sensor would compute: the trigger's P, a filter's gains."""
+    trigger = resolved.trigger.resolved(resolved.model.trigger_matrices)
+    if resolved.observer is None:
+        return {"trigger": trigger}
+    return {"trigger": trigger, "observer": resolved.observer.with_gains(assumed_model(resolved))}
 
 
 def _resolved_plant(loop: Scenario, model: ModelSection) -> PlantSection:

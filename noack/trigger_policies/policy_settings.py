@@ -17,11 +17,13 @@ from pydantic import Field, FiniteFloat, field_validator
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.core.periods import Period, exact_ns
-from noack.settings.section import MatrixRows, ReadTable, ScenarioSection, require_shape
+from noack.settings.section import MatrixRows, ReadTable, ScenarioSection, require_shape, rows_of
 from noack.trigger_policies.trigger_rule import Policy, TriggerRule, require_rule
 
 Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]
 Ratio = Annotated[FiniteFloat, Field(gt=0, le=1e9)]
+_SOLVED = 1e-6
+"""Largest residual of AᵀP + PA = −Q for a stated P, as a share of its largest term."""
 IntervalS = Annotated[FiniteFloat, Field(ge=1e-9, le=1e7)]
 
 if TYPE_CHECKING:
@@ -70,6 +72,14 @@ class PolicySettings(ScenarioSection):
         Raises:
             CallerError: the policy cannot be used with this model.
         """
+
+    def resolved(self, model: ModelMatrices) -> Self:
+        """Return settings with all numbers that the trigger computes from the model.
+
+        Raises:
+            CallerError: the policy cannot be used with this model.
+        """
+        return self
 
     @property
     @abstractmethod
@@ -122,6 +132,8 @@ class LyapunovFunctionSettings(WeightedSettings):
     Q: MatrixRows | None = None
     """Q by rows, n x n, symmetric and positive definite; the identity unless given. P solves
     AᵀP + PA = −Q of the closed loop A = Â + B̂K."""
+    P: MatrixRows | None = None
+    """P by rows, n x n. A resolved scenario has it. It follows from Q, so leave it out."""
 
     def check(self, n: int, why: str) -> None:
         """Require matrices of the right shapes, and a positive definite Q."""
@@ -131,19 +143,35 @@ class LyapunovFunctionSettings(WeightedSettings):
             Q = np.array(self.Q)
             if not np.allclose(Q, Q.T, rtol=1e-12, atol=0.0) or np.linalg.eigvalsh(Q)[0] <= 0:
                 raise ValueError("trigger.Q: must be symmetric and positive definite")
+        require_shape(self.P, "trigger.P", (n, n), why)
+        if self.P is not None and not np.array_equal(np.array(self.P), np.array(self.P).T):
+            raise ValueError("trigger.P: must be symmetric")
+
+    def resolved(self, model: ModelMatrices) -> Self:
+        """Return settings with P."""
+        return self.model_copy(update={"P": rows_of(self.lyapunov_function(model)[0])})
 
     def lyapunov_function(self, model: ModelMatrices) -> tuple[Matrix, Matrix]:
         """Return P and Q with AᵀP + PA = −Q of the model's closed loop, each (n, n).
 
         Raises:
-            CallerError: the closed loop is not stable.
+            CallerError: the closed loop is not stable, or a stated P does not belong to it.
         """
+        A, Q = model.A + model.B @ model.K, np.eye(len(model.A)) if self.Q is None else np.array(self.Q)
+        if self.P is None:
+            return self._solution(A, Q), Q
+        P = np.array(self.P)
+        terms = np.abs(A.T) @ np.abs(P) + np.abs(P) @ np.abs(A) + np.abs(Q)
+        if (np.abs(A.T @ P + P @ A + Q) > _SOLVED * terms.max()).any():
+            raise CallerError("trigger.P: AᵀP + PA is not −Q for A = Â + B̂K; leave P out")
+        return P, Q
+
+    @staticmethod
+    def _solution(A: Matrix, Q: Matrix) -> Matrix:
         from scipy.linalg import solve_continuous_lyapunov  # slow to import
 
-        A = model.A + model.B @ model.K
         if spectral_abscissa(A) >= 0:
             raise CallerError("trigger.policy: this one needs a Lyapunov function, but Â + B̂K is not stable")
-        Q = np.eye(len(A)) if self.Q is None else np.array(self.Q)
         with warnings.catch_warnings(action="ignore"):  # of an inaccurate P, which is checked
             P = np.asarray(solve_continuous_lyapunov(A.T, -Q), dtype=np.float64)
         P = (P + P.T) / 2
@@ -152,7 +180,7 @@ class LyapunovFunctionSettings(WeightedSettings):
                 "trigger.policy: this one needs a Lyapunov function, and none is found within "
                 "rounding: modes of Â + B̂K differ too much"
             )
-        return P, Q
+        return P
 
 
 class CombinedSettings(PolicySettings):
@@ -177,6 +205,9 @@ class CombinedSettings(PolicySettings):
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         rule = require_rule(self.rule.trigger_policy(model))
         return self.combined(rule, nanoseconds(self.interval_s))
+
+    def resolved(self, model: ModelMatrices) -> Self:
+        return self.model_copy(update={"rule": self.rule.resolved(model)})
 
     @property
     def weight(self) -> MatrixRows | None:

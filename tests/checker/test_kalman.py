@@ -1,25 +1,25 @@
-"""Kalman filters: balls of their gains, the loops that they are for, and documents that prove nothing."""
+"""Kalman filters: the gains that a scenario states, and documents that prove nothing."""
 
 from collections.abc import Mapping
-from fractions import Fraction
-from itertools import islice, repeat
-from typing import Any
+from itertools import islice
 
 import numpy as np
 import pytest
-from flint import arb, arb_mat
 from scipy.linalg import expm, solve_discrete_are
 
 from cosim.analysis.witnesses import WitnessedStatement, find_statement
 from cosim.simulation.virtual_time import simulate
+from noack.core.core_library import core, pointer_to, reals_at
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix
 from noack.observers.kalman import KalmanSettings
+from noack.observers.observer_settings import EstimationModel
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import resolve
-from noack.theory.certificates.conditions import with_stated_numbers
-from noack_check.balls import identity, matrix, number, zeros
+from noack.settings.section import rows_of
+from noack_check.balls import number
 from noack_check.check import RejectedError
-from noack_check.kalman import ROUNDED, KalmanFilter
 from noack_check.keys import RefusedError
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
@@ -53,120 +53,123 @@ FILTERS = {
 }
 
 
+def textbook_gains(A: Matrix, model: EstimationModel, std: Matrix, count: int) -> list[Matrix]:
+    """Return the first gains of the filter, by its covariance before each measurement."""
+    P, found = np.diag(np.square(std)), []
+    for _ in range(count):
+        L = P @ model.C.T @ np.linalg.inv(model.C @ P @ model.C.T + model.R)
+        found.append(L)
+        rest = np.eye(len(A)) - L @ model.C
+        P = rest @ P @ rest.T + L @ model.R @ L.T
+        for _ in range(model.steps):
+            P = model.Ad @ P @ model.Ad.T + model.Q
+    return found
+
+
 @pytest.mark.parametrize("name", FILTERS)
-def test_the_gains_that_noack_runs_with_are_in_the_balls(name: str) -> None:
+def test_a_resolved_scenario_states_the_gains_that_the_filter_uses(name: str) -> None:
     resolved = first_loop(SCENARIO, *FILTERS[name])
-    assert resolved.observer is not None
-    observer = read_loop(tables_of(resolved), box=False, ideal=False).observer
-    assert observer is not None
-    balls, own = observer.gains, resolved.observer.gains(assumed_model(resolved))
-    largest = 0.0
-    for test, gain in enumerate(islice(own, 3 * len(balls))):
-        for ball, value in zip(balls[min(test, len(balls) - 1)].entries(), gain.ravel(), strict=True):
-            assert ball.contains(arb(float(value)))
-            if test < len(balls) - 1 and ball.rad() > 0:
-                largest = max(largest, abs(float(arb(float(value)) - ball.mid())) / float(ball.rad()))
-    assert largest < 0.1  # the room for rounding is ample
-    assert len(balls) > 3
+    observer = resolved.observer
+    assert isinstance(observer, KalmanSettings)
+    assert observer.gains is not None
+    stated, model = np.array(observer.gains), assumed_model(resolved)
+    expected = textbook_gains(model.Ad, model, np.array(observer.initial_std), len(stated) + 400)
+    largest = np.abs(stated).max()
+    np.testing.assert_allclose(stated, expected[: len(stated)], rtol=1e-6, atol=1e-9 * largest)
+    assert np.abs(stated[-1] - expected[-1]).max() < 1e-5 * largest
+    of_loop = read_loop(tables_of(resolved), box=False, ideal=False).observer
+    assert of_loop is not None
+    assert [floats(gain).tolist() for gain in of_loop.gains] == stated.tolist()
+    used = [*islice(observer.gains_of(model), len(stated) + 2)]
+    assert np.array_equal(np.array(used), np.array([*stated, stated[-1], stated[-1]]))
 
 
-def test_the_last_ball_has_the_steady_gain() -> None:
+def test_the_last_gain_is_the_steady_one() -> None:
     resolved = first_loop(SCENARIO)
     model = assumed_model(resolved)
     A, Q = model.between_measurements()
     P = solve_discrete_are(A.T, model.C.T, Q, model.R)
     L = P @ model.C.T @ np.linalg.inv(model.C @ P @ model.C.T + model.R)
-    observer = read_loop(tables_of(resolved), box=False, ideal=False).observer
-    assert observer is not None
-    for ball, value in zip(observer.gains[-1].entries(), L.ravel(), strict=True):
-        assert ball.contains(arb(float(value)))
-        assert ball.rad() < 1e-5
+    assert isinstance(resolved.observer, KalmanSettings)
+    np.testing.assert_allclose(np.array(resolved.observer.gains)[-1], L, rtol=1e-5)
 
 
-def test_balls_contain_the_exact_gains_of_a_scalar_filter() -> None:
-    """P ← a²P r/(P + r) + q, in exact fractions."""
-    a, q, r, P = Fraction(5, 4), Fraction(1, 8), Fraction(1, 2), Fraction(3)
-    one = [[number(value)] for value in (a, q, r, P)]
-    flow, added, R, start = (arb_mat([row]) for row in one)
-    balls = KalmanFilter(flow, added, 1, identity(1), R, start).gains()
-    for test in range(8):
-        exact = P / (P + r)
-        ball = balls[min(test, len(balls) - 1)][0, 0]
-        assert ball.contains(number(exact))
-        P = a * a * P * r / (P + r) + q
-    assert balls[0][0, 0].rad() < 2 * ROUNDED
+def test_the_sensor_uses_exactly_the_stated_gains() -> None:
+    """Other gains within the tolerance give other estimates: the filter does not compute its own."""
+    resolved = first_loop(SCENARIO, OFTEN)
+    observer = resolved.observer
+    assert isinstance(observer, KalmanSettings)
+    moved = tuple(map(rows_of, np.array(observer.gains) * (1 + 5e-7)))
+    other = resolved.model_copy(update={"observer": observer.model_copy(update={"gains": moved})})
+    assert resolve(other).observer == other.observer
+    for each in (resolved, other):
+        gains = np.array(each.observer.gains)  # type: ignore[union-attr]
+        run, model = simulate(each), assumed_model(each)
+        measured, x_hat = run[SENSOR_MEASUREMENT], np.zeros(2)
+        for k, row in enumerate(measured):
+            for u in row["u_applied"].reshape(model.steps, -1) if k else ():
+                x_hat = model.Ad @ x_hat + model.Bd @ u
+            L = gains[min(k, len(gains) - 1)]
+            x_hat = x_hat + L @ (row["y"] - model.C @ x_hat)
+            assert np.abs(row["x"] - x_hat).max() < 1e-12
+            x_hat = row["x"]
 
 
-def test_steps_of_the_plant_add_up() -> None:
-    """With k steps to a measurement, the gains are those of one step k times as long."""
-    flow, added = matrix([[1.0, 0.125], [0.0, 1.0]]), matrix([[0.25, 0.0], [0.0, 0.5]])
-    C, R, start = matrix([[1.0, 0.0]]), matrix([[1.0]]), identity(2)
-    whole, power, Q = zeros(2, 2), identity(2), added
-    for _ in range(3):
-        whole, power = whole + power * Q * power.transpose(), flow * power
-    pairs = zip(
-        KalmanFilter(flow, added, 3, C, R, start).gains(),
-        KalmanFilter(power, whole, 1, C, R, start).gains(),
-        strict=True,
+def test_after_a_missing_measurement_the_gain_follows_from_the_covariance() -> None:
+    observer = KalmanSettings(
+        kind="kalman", initial_std=(1.0,), Q=((1.0,),), R=((1.0,),), gains=(((0.5,),), ((0.6,),))
     )
-    assert all(one.overlaps(other) for one, other in pairs)
-
-
-@pytest.mark.parametrize(
-    ("flow", "added", "R", "message"),
-    [
-        (1.0, 0.0, 1.0, "constant after 1000"),  # the gains fall as 1/k
-        (1.5, -1.0, 1e-3, "positive definite"),
-        (1.0, 1.0, -1.0, "positive definite"),
-        (float("inf"), 1.0, 1.0, "constant|definite"),
-    ],
-)
-def test_filters_without_a_constant_gain_are_refused(
-    flow: float, added: float, R: float, message: str
-) -> None:
-    one = [matrix([[value]]) for value in (flow, added, R, 1e-3 if R < 0 else 0.5)]
-    with pytest.raises(RefusedError, match=message):
-        KalmanFilter(one[0], one[1], 1, identity(1), one[2], one[3]).gains()
+    one = np.eye(1)
+    core_observer = observer.observer(EstimationModel(one, one, one, one, one, one, 1), {})
+    nothing = pointer_to(np.zeros(1), "double *")
+    core.noack_observer_gain(core_observer)
+    assert reals_at(core_observer.gain, 1)[0] == 0.5
+    core.noack_observer_correct(core_observer, nothing)
+    core.noack_observer_gain(core_observer)
+    assert reals_at(core_observer.gain, 1)[0] == 0.6
+    core_observer.has_gap = 1
+    for _ in range(2):  # P is 0.5 after the first measurement
+        core.noack_observer_predict(core_observer, nothing)
+    core.noack_observer_gain(core_observer)
+    assert reals_at(core_observer.gain, 1)[0] == pytest.approx(2.5 / 3.5)
 
 
 # The scenario.
 
 
-def test_the_stated_covariances_are_those_of_the_scenario() -> None:
+def test_other_gains_than_those_of_the_covariances_are_refused() -> None:
     resolved = first_loop(SCENARIO, OFTEN)
-    stated = with_stated_numbers(resolved)
-    assert with_stated_numbers(stated).observer == stated.observer
-    assert resolved.observer is not None
-    assert stated.observer is not None
-    pairs = zip(
-        resolved.observer.gains(assumed_model(resolved)),
-        stated.observer.gains(assumed_model(stated)),
-        strict=False,
+    assert resolve(resolved).observer == resolved.observer
+    assert isinstance(resolved.observer, KalmanSettings)
+    noisier = resolved.observer.model_copy(update={"initial_std": (0.3, 0.3)})
+    with pytest.raises(CallerError, match=r"observer\.gains: not those that follow"):
+        resolve(resolved.model_copy(update={"observer": noisier}))
+
+
+def test_gains_that_do_not_become_constant_are_not_stated() -> None:
+    """The gains of a constant that is measured fall as 1/k."""
+    settings = (
+        "horizon_s=1.0",
+        'observer={kind="kalman",initial_std=[1.0,1.0],Q=[[0.0,0.0],[0.0,1e-300]],R=[[1.0]]}',
     )
-    for first, second in islice(pairs, 50):
-        np.testing.assert_allclose(first, second, rtol=1e-12, atol=1e-15)
+    resolved = first_loop("double_integrator", "plant.measurement={C=[[1.0,0.0]],noise_std=[0.1]}", *settings)
+    assert isinstance(resolved.observer, KalmanSettings)
+    assert resolved.observer.gains is None
 
 
-@pytest.mark.parametrize("change", [{"Q": [[1.0]]}, {"R": [[1.0, 0.0], [0.0, 1.0]]}, {"initial_std": [1.0]},
-                                    {"Q": None}, {"R": "1"}, {"input_std": [0.2]}])  # fmt: skip
-def test_what_is_no_filter_is_refused(change: dict[str, Any]) -> None:
+def test_a_filter_without_stated_gains_has_no_statement() -> None:
     tables = resolved_tables(SCENARIO)
-    tables["observer"] |= change
-    with pytest.raises(RefusedError, match=rf"observer\.{next(iter(change))}"):
+    del tables["observer"]["gains"]
+    with pytest.raises(RefusedError, match=r"^observer\.gains: missing"):
         read_loop(tables, box=False, ideal=False)
 
 
-@pytest.mark.parametrize("key", ["Q", "R"])
-def test_a_covariance_that_is_not_symmetric_is_refused(key: str) -> None:
-    """The filter's gains would be those of another matrix than the scenario's."""
-    tables = resolved_tables(SCENARIO, "plant.measurement={C=[[1.0,0.0],[1.0,2.0]],noise_std=[0.002,0.1]}")
-    M = tables["observer"][key]
-    M[0][1] += 1e-12
-    with pytest.raises(RefusedError, match=rf"observer\.{key}: not symmetric"):
+@pytest.mark.parametrize("gains", [[], [[[1.0]]], [[[1.0, 0.0], [1.0, 0.0]]], "1", [[["1"], [1.0]]]])
+def test_what_is_no_list_of_gains_is_refused(gains: object) -> None:
+    tables = resolved_tables(SCENARIO)
+    tables["observer"]["gains"] = gains
+    with pytest.raises(RefusedError, match="observer"):
         read_loop(tables, box=False, ideal=False)
-    M[1][0] += 1e-12
-    M[0][1] = M[1][0]
-    assert read_loop(tables, box=False, ideal=False).observer is not None
 
 
 # Documents and runs.
@@ -231,13 +234,6 @@ def test_random_runs_of_the_loop_with_its_gains_stay_within_the_bounds(document:
     proof = prove(loop, document)
     for seed in range(4):
         assert exceeded(loop, proof, np.random.default_rng(seed), 4.0, by_forms=False) == []
-
-
-def test_gains_that_rounding_moves_have_no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(KalmanSettings, "gains", lambda *_: repeat(np.array([[0.5], [0.5]])))
-    found = find_statement(first_loop(SCENARIO, OFTEN), "own", "schedule", most_work=0)
-    assert found.document is None
-    assert found.reason.startswith("observer: rounding moves its gain at measurement 0")
 
 
 def test_no_simulated_run_exceeds_the_bounds(statement: WitnessedStatement) -> None:

@@ -12,7 +12,7 @@ from flint import arb, arb_mat, fmpq
 from cosim.analysis.witnesses import resolved_content
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
-from noack.scenario.resolution import loop_of, rule_of
+from noack.scenario.resolution import loop_of, resolve, rule_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.sections import ActuationSection
 from noack.theory.certificates.conditions import about_reference, allowed_conditions, ideal_conditions
@@ -21,7 +21,7 @@ from noack_check.loop import Loop
 from noack_check.scenario import output_names, read_loop
 from noack_check.sentences import at_least, at_most
 from tests.helpers.resolved_tables import first_loop, resolved_tables, tables_of
-from tests.helpers.shipped import resolved
+from tests.helpers.shipped import resolved, shipped
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 LOADED = {"dc_motor_load", "lane_crosswind_load"}
@@ -456,3 +456,29 @@ def test_a_trigger_whose_matrix_is_not_symmetric_is_refused(name: str, change: f
 def test_a_number_beyond_those_of_floats_is_printed() -> None:
     assert at_most(arb("1.3e400")) == "1.301e+400"
     assert at_least(arb("1.3e400")) == "1.299e+400"
+
+
+def test_the_lyapunov_function_of_a_trigger_is_stated_and_used_as_it_is() -> None:
+    trigger = 'trigger={policy="dynamic", sigma=0.2, theta_s=0.5, decay_per_s=0.3}'
+    own = first_loop("double_integrator", trigger)
+    tables = tables_of(own)
+    P = np.array(tables["trigger"]["P"])
+    A, B, K = (np.array(tables["model"][key]) for key in ("A", "B", "gain"))
+    F = A + B @ K
+    np.testing.assert_allclose(F.T @ P + P @ F, -np.eye(len(A)), atol=1e-9)
+    moved = (P * (1 + 2e-7)).tolist()
+    rules = []
+    for stated in (P.tolist(), moved):
+        tables["trigger"]["P"] = stated
+        rule = read_loop(tables, box=False, ideal=False).rule
+        assert rule.memory is not None
+        rules.append(floats(rule.memory.gain)[: len(A), len(A) :])
+        np.testing.assert_array_equal(rules[-1], -np.array(stated) @ B)
+    settings = own.trigger.model_copy(update={"P": tuple(map(tuple, moved))})
+    of_process = resolve(own.model_copy(update={"trigger": settings}))
+    assert of_process.trigger == settings
+    with pytest.raises(CallerError, match=r"trigger\.P: AᵀP \+ PA is not −Q"):
+        resolve(shipped("double_integrator", trigger, "trigger.P=[[1.0,0.0],[0.0,1.0]]"))
+    del tables["trigger"]["P"]
+    with pytest.raises(RefusedError, match=r"trigger\.P: missing"):
+        read_loop(tables, box=False, ideal=False)

@@ -96,7 +96,7 @@ def check_observer(run: ExplainedLoop) -> None:
     if observer is None:
         return
     rows, model = run.rows(SENSOR_MEASUREMENT), assumed_model(run.scenario)
-    gains, x_hat = observer.gains(model), _first_estimate(run)
+    gains, x_hat = observer.gains_of(model), _first_estimate(run)
     for number, row in enumerate(rows):
         if row["sequence"] != number or not is_moderate(row["x"], row["y"]):
             return  # rows are missing, or the run diverges
