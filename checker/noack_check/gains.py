@@ -45,7 +45,7 @@ integrals are over times that do not overlap. So what p exceeds |p̂| by before 
 t_a sup |C e^{Hs} q| times this. Neither times between events nor numbers of updates on their way are assumed.
 With a periodic rule t − t_r ≤ Mh + d: v is followed from t_r, and nothing is counted as lost.
 
-*The input* is K e^{−Hs} x_c of an age s ≤ a: p = K e^{−Hs} e_c − sKHx + ∫₀ˢ (s − τ) K e^{−Hτ} H² x dτ.
+*The input* is K e^{−Hs} x_c of an age s, |s| ≤ a: p = K e^{−Hs} e_c − sKHx + ∫₀ˢ (s − τ) K e^{−Hτ} H² x dτ.
 With a ball C around K e^{−Hs} for all ages, |p_j| ≤ |C_j e_c| + a |K_j H x| + a²/2 |C_j H² x|.
 
 *The state.* |Cx| ≤ sup |C e^{(A+BK)s} x(0)| + Σ_q ∫ |C e^{(A+BK)s} q| ds · |q̂|. By what p exceeds |p̂|
@@ -69,7 +69,17 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import beside, columns_of, identity, is_positive, is_zero, rows_of, square, upto, zeros
+from noack_check.balls import (
+    beside,
+    between,
+    columns_of,
+    identity,
+    is_positive,
+    is_zero,
+    rows_of,
+    square,
+    zeros,
+)
 from noack_check.check import RejectedError
 from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
 from noack_check.loop import Loop, Rule
@@ -284,7 +294,7 @@ class _Responses:
         self.of_mismatch = range(first, first + len(self.mismatched))
 
         # The state.
-        self.aged = K * (-1 * upto(arb(times.age)) * H).exp()
+        self.aged = K * (-1 * between(-arb(times.lead), arb(times.age)) * H).exp()
         share, shift = self.compared.share, loop.weight * self.compared.shift
         entries = {f"x[{i}]": rows_of(one, [i]) for i in range(n)}
         entries |= {f"y[{i}]": rows_of(loop.output_rows, [i]) for i in range(loop.output_rows.nrows())}
@@ -295,7 +305,7 @@ class _Responses:
         outputs |= {f"Kx {j}": rows_of(loop.gain, [j]) for j in range(m)}
         outputs |= {f"Ex {i}": rows_of(mismatch, [i]) for i in self.mismatched}
         outputs |= {"WEx": loop.weight * mismatch} if self.mismatched else {}
-        if times.age > 0:
+        if times.from_tick > 0:
             outputs |= {f"aged {j}": rows_of(K, [j]) * H for j in range(m)}
             outputs |= {f"bent {j}": rows_of(self.aged, [j]) * H * H for j in range(m)}
         columns = [*self.driving, loop.start]
@@ -463,7 +473,7 @@ class UnitGains:
 
     def by_age(self, j: int) -> Form:
         """Return the bound of what the age of the input adds to p_j, of x."""
-        age = arb(self.loop.times.age)
+        age = arb(self.loop.times.from_tick)
         if age == 0:
             return {}
         return _sum((age, self.state(f"aged {j}")), (age**2 / 2, self.state(f"bent {j}")))

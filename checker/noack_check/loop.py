@@ -67,7 +67,7 @@ class Times(NamedTuple):
     delay: fmpq
     """The first input that is computed from an update acts within this time after its event, if at all."""
     age: fmpq
-    """The input that acts at t is K e^{−Hs} x_c(t) for an s of at most this."""
+    """The input that acts at t is K e^{−Hs} x_c(t) for an s from −:attr:`lead` to this."""
     start: fmpq
     """The first input acts within this time; until then the input is 0."""
     least_period: fmpq = fmpq(0)
@@ -80,6 +80,13 @@ class Times(NamedTuple):
     """Two events of a rule that compares are at most this far apart, as with a deadline; 0: not known."""
     due: fmpq = fmpq(0)
     """An event that comes without its comparison comes at least this time after the last one."""
+    lead: fmpq = fmpq(0)
+    """The input that acts may have been computed for a time that is later by this, as at a late step."""
+
+    @property
+    def from_tick(self) -> fmpq:
+        """The largest difference between the time and the time for which the acting input was computed."""
+        return max(self.age, self.lead)
 
     @property
     def least_apart(self) -> fmpq:

@@ -414,21 +414,23 @@ class Model:
         return (square(self.loop.weight * error) - factor**2 * assumed,)
 
     def _gains(self) -> list[arb_mat]:
-        """Return matrices in whose hull K e^{−Hs} is, for all ages s.
+        """Return matrices in whose hull K e^{−Hs} is, for all ages s, which are −lead at least.
 
         On each part [a, a + q] it is a Taylor polynomial of degree d, up to q^{d+1}/(d+1)! ·
         sup|K H^{d+1} e^{−Hs}|, and the polynomial is in the hull of its Bézier points
         b_i = Σ_{k ≤ i} C(i, k)/C(d, k) q^k t_k, with t_k its coefficients.
         """
-        K, H, age = self.loop.gain, self.loop.H, arb(self.loop.times.age)
-        if self.loop.holds or not age > 0:
+        K, H, lead = self.loop.gain, self.loop.H, arb(self.loop.times.lead)
+        span = lead + arb(self.loop.times.age)
+        if self.loop.holds or not span > 0:
             return [K]
+        first = K * (lead * H).exp() if lead > 0 else K
         if not self.is_exact:  # a parabola through three points
-            middle, end = K * (-age / 2 * H).exp(), K * (-age * H).exp()
-            return [K, 2 * middle - (K + end) / 2, end]
+            middle, end = first * (-span / 2 * H).exp(), first * (-span * H).exp()
+            return [first, 2 * middle - (first + end) / 2, end]
         for parts in (1, 2, 4, 8):
-            q = age / parts
-            found = [_corners(K * (-part * q * H).exp(), H, q, DEGREE) for part in range(parts)]
+            q = span / parts
+            found = [_corners(first * (-part * q * H).exp(), H, q, DEGREE) for part in range(parts)]
             if max(float(rest.abs_upper()) for _, rests in found for rest in rests.entries()) < SMALL:
                 break
         return [point + rests for points, rests in found for point in points]

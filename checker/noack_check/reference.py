@@ -149,8 +149,8 @@ class Matrices(NamedTuple):
 class Moments(NamedTuple):
     """The times that the coordinates depend on, in s."""
 
-    age: fmpq
-    """Largest age of an input."""
+    from_tick: fmpq
+    """Largest difference between the time and the time for which an input was computed."""
     start: fmpq
     """The first input acts within this time."""
     end: fmpq
@@ -199,12 +199,13 @@ def about_reference(
     if any(entry != 0 or entry.rad() != 0 for jump in jumps for entry in rows_of(jump, range(n)).entries()):
         total = sum((frobenius(rows_of(jump, range(n))) for jump in jumps), arb(0))
         offset = total * (arb.pos_inf() if error_gain is None else error_gain)
-    held = [arb(times.age) * rate for rate in rates[n:]]
+    held = [arb(times.from_tick) * rate for rate in rates[n:]]
     held = [
-        size + step for size, step in zip(held, _steps_together(used, jumps, n, m, times.age), strict=True)
+        size + step
+        for size, step in zip(held, _steps_together(used, jumps, n, m, times.from_tick), strict=True)
     ]
     input_sizes = [
-        size + _row_norm(loop.gain, j) * offset if times.age > 0 or offset != 0 else size
+        size + _row_norm(loop.gain, j) * offset if times.from_tick > 0 or offset != 0 else size
         for j, size in enumerate(held)
     ]
     state = [
@@ -229,15 +230,15 @@ def about_reference(
 
 
 def _steps_together(
-    used: Sequence[Segment], jumps: Sequence[arb_mat], n: int, m: int, age: fmpq
+    used: Sequence[Segment], jumps: Sequence[arb_mat], n: int, m: int, within: fmpq
 ) -> list[arb]:
-    """Return the largest sum of |jumps| of each entry of u_r within the age of an input."""
-    if not age > 0:
+    """Return the largest sum of |jumps| of each entry of u_r within a time."""
+    if not within > 0:
         return [arb(0)] * m
     begins, largest = [segment.begin for segment in used[1:]], [arb(0)] * m
     for first, begin in enumerate(begins):
         total, last = [arb(0)] * m, first
-        while last < len(begins) and begins[last] <= begin + age:
+        while last < len(begins) and begins[last] <= begin + within:
             total = [size + abs(jumps[last][n + j, 0]) for j, size in enumerate(total)]
             last += 1
         largest = _most([largest, total])

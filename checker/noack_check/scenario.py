@@ -124,7 +124,7 @@ def _about_reference(loop: Loop, resolved: Table) -> Loop:
     segments = _segments(_table(resolved, "controller"), n - loop.loads, m)
     matrices = Matrices(loop.A, loop.B, loop.half_A, loop.half_B, loop.H, loop.gain)
     moments = Moments(
-        loop.times.age, loop.times.start, fmpq(*_real(resolved, "horizon_s").as_integer_ratio())
+        loop.times.from_tick, loop.times.start, fmpq(*_real(resolved, "horizon_s").as_integer_ratio())
     )
     about = about_reference(
         [padded(segment, n - loop.loads, loop.loads) for segment in segments],

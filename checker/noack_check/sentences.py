@@ -30,10 +30,11 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
         parts.append(f"at most {most_losses(direction, 'network.actuation')} of inputs")
     if times.sampling > 0:
         ms = {name: f"{float(1000 * arb(getattr(times, name)).mid()):.6g} ms" for name in times._fields}
+        youngest = f"−{ms['lead']}" if times.lead > 0 else "0"
         parts += [
             f"tests every {ms['sampling']}",
             f"updates act within {ms['delay']}",
-            f"inputs at most {ms['age']} old",
+            f"inputs {youngest} to {ms['age']} old",
             f"the first within {ms['start']}",
         ]
         if times.period > 0:

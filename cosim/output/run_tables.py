@@ -46,6 +46,7 @@ _SCHEDULE = {
     "sampling_s": "between two measurements",
     "delay_s": "from an event to the plant",
     "hold_s": "age of an input",
+    "lead_s": "lead of an input",
     "start_s": "until the first input",
 }
 _MOST_NETWORK_ROWS = 3
@@ -347,6 +348,8 @@ def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
     rows = []
     for name, words in _SCHEDULE.items():
         times_s = [getattr(part, name) if part else None for part in (allowed, observed, certified)]
+        if not any(times_s):  # no input was computed for a later time
+            continue
         # At a set-point a certificate needs no first input: it is 0 there.
         texts = (duration, duration, duration_at_least)
         cells = [text(time_s) if time_s else NONE for text, time_s in zip(texts, times_s, strict=True)]

@@ -97,7 +97,8 @@ class Forms:
         waits = [("0 later", delay)] if delay else []
         begins = [("start, 0 later", start)] if start else []
         places = [(f"{j} lost", self.times[0]) for j in range(losses + 1)] + waits + begins
-        ages = [0.0, age, *(age * rng.random(3))]
+        youngest = -self.times[-1]
+        ages = [youngest, age, *(youngest + (age - youngest) * rng.random(3))]
         return (
             all(self._flow_holds(*place, node, s) for place in places for node in (0, 1) for s in ages)
             and all(

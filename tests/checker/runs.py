@@ -86,7 +86,7 @@ def exceeded(
 ) -> list[Exceeded]:
     """Return where a random run exceeds what is proven; by forms this is a root of a sum of squares."""
     plant, times, rule = _Plant(loop, rng), [float(t.p) / float(t.q) for t in loop.times], loop.rule
-    sampling, least, delay, age, start, *periods, dwell, longest, due = times
+    sampling, least, delay, age, start, *periods, dwell, longest, due, lead = times
     next_event = float(rng.choice(periods)) if periods[1] else np.inf  # of a periodic rule
     if periods[1] and loop.observer is None:
         least = sampling = periods[1] / _PARTS
@@ -118,7 +118,7 @@ def exceeded(
     remembered.start(y)
     first_input = start * float(rng.choice([0.0, 1.0, rng.random()]))
     style = rng.integers(3)
-    ages = [0.0, age, age / 2]
+    ages = [-lead, age, age / 2]
     t, lost, events = 0.0, 0, [0.0]
     area = last_size = last_test = 0.0  # of a rule that integrates
     arriving: list[tuple[float, float, Array]] = []

@@ -57,6 +57,7 @@ def conditions_ns(resolved: Scenario) -> list[int]:
     if rule.grid_ns:
         sampling_s = rule.grid_ns * 1e-9
         least_s = least_s if rule.longest_ns % rule.grid_ns and rule.longest_ns < np.inf else sampling_s
+    assert conditions.lead_s == 0.0
     times_s = (sampling_s, least_s, conditions.delay_s, conditions.hold_s, conditions.start_s)
     return [round(time_s * 1e9) for time_s in times_s]
 

@@ -67,7 +67,7 @@ def test_the_program_prints_what_is_proven(
     bound = re.search(r"its plant, its schedule: ‖x‖ ≤ (\S+) e", text)
     assert bound is not None
     assert 0.285 < float(bound[1]) < 0.42  # the first one is the largest that was found
-    assert "losses, tests every 2 ms, updates act within 6 ms, inputs at most 7 ms old, the first" in text
+    assert "losses, tests every 2 ms, updates act within 6 ms, inputs 0 to 7 ms old, the first" in text
 
 
 def test_what_a_statement_assumes_is_printed(file: Path) -> None:

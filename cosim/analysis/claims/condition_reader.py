@@ -52,6 +52,7 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
         sampling=_gaps(measured["t_ns"], end_ns),
         delay=delay,
         hold=inputs.hold,
+        lead=inputs.lead,
         start_s=inputs.start_s,
         watchdog=inputs.watchdog,
         safe_input=inputs.safe_input,

@@ -37,7 +37,9 @@ class PlantInputs(NamedTuple):
     """The inputs of a run's plant."""
 
     hold: SampledSeries
-    """Ages of inputs, at each step."""
+    """Largest age of the input, until the next step, at each step."""
+    lead: SampledSeries
+    """By how much the input was computed for a later time, at the steps at which it was."""
     watchdog: SampledSeries
     """Ages of actuations that the watchdog replaced."""
     safe_input: SampledSeries
@@ -63,14 +65,16 @@ def plant_inputs(record: RunRecord) -> PlantInputs:
     highest = np.maximum.accumulate(np.append(NO_SEQUENCE, newest))
     is_input = newest != NO_SEQUENCE
     controlled = is_input & (highest[1:] >= first_state)
-    # A late plant step may apply an input with a model time after the step's nominal time.
     input_ns = sent_ns + ahead_ns
-    age_ns = np.maximum(t_ns + timing.plant_period_ns - input_ns, input_ns - t_ns)
+    age_ns = np.maximum(t_ns + timing.plant_period_ns - input_ns, 0)
+    # A late step of the plant may apply an input with a model time after the step's nominal time.
+    lead_ns = np.maximum(input_ns - t_ns, 0)
     replaces = record.scenario.plant.watchdog.policy != "hold"
     replaced = controlled & replaces & too_old(t_ns, sent_ns, timing.actuation_timeout_ns)
     # Until the first input with a state, the certificates assume that the input is 0.
     safe = is_input & ~controlled & ~(sizes == 0)
     step_s, is_held = t_ns * 1e-9, controlled & ~replaced
+    leads = is_held & (lead_ns > 0)
     # Each actuation is first applied at the step at which it is the newest one.
     rises = np.diff(highest) > 0
     latched, latched_ns = highest[1:][rises], t_ns[rises]
@@ -78,6 +82,7 @@ def plant_inputs(record: RunRecord) -> PlantInputs:
     applied_ns = [int(latched_ns[i]) if i < len(latched) else None for i in first]
     return PlantInputs(
         hold=SampledSeries(step_s[is_held], age_ns[is_held] * 1e-9),
+        lead=SampledSeries(step_s[leads], lead_ns[leads] * 1e-9),
         watchdog=SampledSeries(step_s[replaced], (t_ns - sent_ns)[replaced] * 1e-9),
         safe_input=SampledSeries(step_s[safe], sizes[safe]),
         start_s=float(step_s[np.argmax(controlled)]) if controlled.any() else np.inf,

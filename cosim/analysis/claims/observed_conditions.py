@@ -37,6 +37,7 @@ CAUSES = {
     "sampling": "no measurement for up to {:.4g} s, {:.4g} s allowed",
     "delay": "an update took effect up to {:.4g} s after its event, {:.4g} s allowed",
     "hold": "the applied input was up to {:.4g} s old, {:.4g} s allowed",
+    "lead": "the applied input was computed for a time up to {:.4g} s after its step, {:.4g} s allowed",
     "start": "the plant applied its first input at {:.4g} s, {:.4g} s allowed",
     "watchdog": "the watchdog replaced the input: the newest actuation was up to {:.4g} s old, {:.4g} s "
     "allowed",
@@ -47,7 +48,7 @@ CAUSES = {
 
 The other assumptions are the rules of the guarantee, under their own names; "dropouts" is the limit
 of consecutive losses."""
-SCHEDULE = ("delay", "hold", "start")
+SCHEDULE = ("delay", "hold", "lead", "start")
 """The assumptions about lateness; their limits are ``delay_s`` and so on of the conditions.
 
 A certificate holds for every run that meets its conditions, however they were chosen. So a run that
@@ -153,7 +154,9 @@ class ObservedConditions(NamedTuple):
     """Time from each event until the plant applied an input computed with its update, after the
     first input: until then it is part of ``start_s``."""
     hold: SampledSeries
-    """Largest difference between the time and the model time of the applied input, per step."""
+    """Largest age of the applied input, per step."""
+    lead: SampledSeries
+    """By how much the applied input was computed for a later time, at the steps at which it was."""
     start_s: float
     """Time at which the plant applied the first input of a controller with a state, or infinity."""
     watchdog: SampledSeries
@@ -206,6 +209,7 @@ class ObservedConditions(NamedTuple):
             "sampling": (self.sampling, conditions.sampling_s),
             "delay": (self.delay, conditions.delay_s),
             "hold": (self.hold, conditions.hold_s),
+            "lead": (self.lead, conditions.lead_s),
             "start": (self._first_input(conditions.start_s), conditions.start_s),
             "watchdog": (self.watchdog, self.timeout_s),
             "safe input": (self.safe_input, -1.0),  # every value is a violation
@@ -246,6 +250,7 @@ class ObservedConditions(NamedTuple):
         return allowed._replace(
             delay_s=larger(allowed.delay_s, self.delay),
             hold_s=larger(allowed.hold_s, self.hold),
+            lead_s=larger(allowed.lead_s, self.lead),
             start_s=larger(allowed.start_s, self._first_input(allowed.start_s)),
         )
 
@@ -261,6 +266,7 @@ class ObservedConditions(NamedTuple):
             "sampling_s": self.sampling.largest(),
             "delay_s": self._largest_delay_s(),
             "hold_s": self.hold.largest(),
+            "lead_s": None if self.hold.largest() is None else self.lead.largest() or 0.0,
             "start_s": self.start_s if np.isfinite(self.start_s) else None,
             "clock_error_s": self.clock_error_s,
         }

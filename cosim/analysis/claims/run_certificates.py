@@ -66,7 +66,12 @@ def certificates_under(
     scenario = _checked_by_run(with_constant_load(scenario))
     if not scenario.certificate.prove:
         most_work = 0.0
-    times_s = {"delay": conditions.delay_s, "age": conditions.hold_s, "start": conditions.start_s}
+    times_s = {
+        "delay": conditions.delay_s,
+        "age": conditions.hold_s,
+        "lead": conditions.lead_s,
+        "start": conditions.start_s,
+    }
     longer = {name: fmpq(round(t_s * NS_PER_S), NS_PER_S) for name, t_s in times_s.items()}
     return [
         certificate_of(

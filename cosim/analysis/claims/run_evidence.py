@@ -42,7 +42,9 @@ from noack.theory.paper import Theorem2
 ROUNDING = 1e-9
 """Relative rounding error of an exact computation over a run of 10,000 steps."""
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
-_ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)
+_ANY = NetworkConditions(
+    sys.maxsize, sampling_s=_LONG_S, delay_s=_LONG_S, hold_s=_LONG_S, start_s=_LONG_S, lead_s=_LONG_S
+)
 
 
 @dataclass(frozen=True)

@@ -301,6 +301,7 @@ class ConditionsPart(SummaryPart):
     sampling_s: Real
     delay_s: Real
     hold_s: Real
+    lead_s: Real = None
     start_s: Real
     clock_error_s: Real = None
 
@@ -311,6 +312,7 @@ class AllowedConditionsPart(SummaryPart):
     sampling_s: float
     delay_s: float
     hold_s: float
+    lead_s: float = 0.0
     start_s: float
 
 

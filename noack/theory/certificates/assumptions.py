@@ -312,10 +312,12 @@ def _conditions(
     sampling = f"every {1e3 * conditions.sampling_s:g} ms" if conditions.sampling_s else "continuously"
     delay = network_delay_text(resolved) if conditions.delay_s else ""
     network = f"; {delay}" if delay else ""
+    youngest = f"−{1e3 * conditions.lead_s:g}" if conditions.lead_s else "0"
+    ages = f"{youngest} to {1e3 * conditions.hold_s:g}"
     schedule = (
         (f"the trigger is tested {sampling}", ""),
         (f"an update reaches the plant within {1e3 * conditions.delay_s:g} ms of its event", network),
-        (f"the applied input is at most {1e3 * conditions.hold_s:g} ms old", ""),
+        (f"the applied input is {ages} ms old", ""),
         (f"the first input arrives within {1e3 * conditions.start_s:g} ms", ""),
     )
     status = AssumptionStatus.ASSUMED

@@ -52,13 +52,16 @@ class NetworkConditions(NamedTuple):
     delay_s: float = 0.0
     """d, the longest time from an event until a delivered update affects the plant's input."""
     hold_s: float = 0.0
-    """σ, the largest difference between the time and the model time of the applied input."""
+    """σ, the largest age of the applied input: by how much its model time is before the time."""
     start_s: float = 0.0
     """Time from which the plant applies the controller's input; before, its input is 0."""
     constraints: tuple[LossRule, ...] = ()
     """Further rules of the guarantee."""
     apart_s: float = 0.0
     """The shortest time between two tests that are on no grid."""
+    lead_s: float = 0.0
+    """σ⁻, by how much the model time of the applied input may be after the time, as at a late step of the
+    plant: no schedule has such inputs, whatever lateness it allows."""
 
     @property
     def guarantee(self) -> LossGuarantee:

@@ -137,3 +137,5 @@ def _check_ages(run: ExplainedLoop, conditions: NetworkConditions, steps: Rows) 
         if is_replaced:
             run.add(t_ns, SCHEDULE, "the watchdog replaced the input")
         _limit(run, t_ns, "the applied input is replaced", age_ns, conditions.hold_s)
+        if input_ns - t_ns > conditions.lead_s * NS_PER_S + _TOLERANCE_NS:
+            run.add(t_ns, SCHEDULE, f"the applied input is for {(input_ns - t_ns) / NS_PER_S:.9f} s later")

@@ -99,7 +99,7 @@ def test_every_cause_is_found_in_hostile_and_damaged_runs(make: Make) -> None:
         causes.update(violation.cause for violation in reported(record))
 
     check()
-    assert causes == {*CAUSES, "dropouts", "atmost 2 in 6", "recover 2"} - {*CLOCK_CAUSES}
+    assert causes == {*CAUSES, "dropouts", "atmost 2 in 6", "recover 2"} - {*CLOCK_CAUSES, "lead"}
 
 
 # --- violation of each condition: the live report, and the evaluation after the run ---------------
@@ -259,7 +259,7 @@ def test_the_worst_case_of_a_schedule_occurs(
     """The assumed delays and ages occur exactly, to the nanosecond."""
     resolved = busy(make, step_ns, tick_ns, every, phase, "first_packet")
     observed, nominal = read_conditions(simulate(resolved)).summary(), nominal_conditions(resolved, 0)
-    for name in ("sampling_s", "delay_s", "hold_s", "start_s"):
+    for name in ("sampling_s", "delay_s", "hold_s", "lead_s", "start_s"):
         assert observed[name] == pytest.approx(getattr(nominal, name), abs=1e-12), name
 
 
