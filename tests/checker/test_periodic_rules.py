@@ -47,7 +47,7 @@ def test_runs_come_near_the_bounds(found: Proved) -> None:
         if b.output in shares
     )
     smaller = witness.proof._replace(bounds=bounds)
-    assert {each.output for _ in range(6) for each in exceeded(loop, smaller, rng, 6.0)} == {"x", "e_c"}
+    assert {each.output for _ in range(4) for each in exceeded(loop, smaller, rng, 6.0)} == {"x", "e_c"}
 
 
 def test_updates_may_be_on_their_way_for_more_than_a_period() -> None:

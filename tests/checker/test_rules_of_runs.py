@@ -37,7 +37,7 @@ POINTS = {"at 0": (), "at a set-point": ("controller.setpoint=[0.7,0.0]",)}
 @pytest.mark.parametrize("name", RULES)
 def test_the_sensor_tests_the_rule_that_is_read(name: str, point: str) -> None:
     text = json.dumps(RULES[name]).replace('": ', '" = ')
-    settings = (f"trigger={text}", "network.mansd=2", 'mode="zoh"', "horizon_s=6.0", *POINTS[point])
+    settings = (f"trigger={text}", "network.mansd=2", 'mode="zoh"', "horizon_s=4.0", *POINTS[point])
     loop = read_loop(resolved_tables("double_integrator", *settings), box=False, ideal=False)
     rows = simulate(resolve(shipped("double_integrator", *settings)))[SENSOR_MEASUREMENT]
     x_r = np.array([0.7, 0.0]) if POINTS[point] else np.zeros(2)

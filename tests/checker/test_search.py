@@ -58,7 +58,7 @@ def test_a_loop_that_starts_at_rest_is_bounded() -> None:
 def test_states_of_any_size_have_bounds_without_a_warning(size: float) -> None:
     """Squares of them overflow in the search."""
     loop = scalar(1, SCHEDULE, level=0.05 * size)._replace(start=number(size) * identity(1))
-    assert 1 < bounds_of(find_witness(loop).proof)["x"] / size < 20
+    assert 1 < bounds_of(find_witness(loop, ("x",)).proof)["x"] / size < 20
 
 
 def test_without_a_finite_value_the_search_ends() -> None:
@@ -123,7 +123,6 @@ def test_a_rate_of_a_similar_loop_with_which_nothing_is_found_is_left() -> None:
         near = {"rate": rate, "bounds": [bound]}
         assert bounds_of(find_witness(loop, (), near=[near]).proof) == bounds_of(alone.proof)
     by_gains = {"rate": 0.25, "gains": {}}
-    assert bounds_of(find_witness(loop, (), near=[by_gains]).proof) == bounds_of(alone.proof)
     rough = [rough_bounds(loop, ["x"], near, Effort(no_progress)).sizes for near in ([], [by_gains])]
     assert rough[0] == rough[1]
 
@@ -194,7 +193,7 @@ def test_progress_rises_to_its_end() -> None:
 
 
 def test_a_search_ends_at_its_limit_of_work() -> None:
-    found = find_witness(double_integrator(), most_work=1e-9).document
+    found = find_witness(scalar(times=SCHEDULE), most_work=1e-9).document
     assert "bounds" not in found
     assert "gains" in found
     mixed = double_integrator().rule._replace(positive=matrix([[1, 0, 1, 0], [0, 0, 0, 1]]))
@@ -207,20 +206,18 @@ def test_a_search_ends_at_its_limit_of_work() -> None:
         effort.add("x", 1.0)
 
 
-def test_a_disturbance_shortens_the_time_between_events_as_little_as_possible() -> None:
-    """Both parts of the drift's bound count in units of their thresholds, 0.05 and 0.0005."""
-    loop = pushed(double_integrator(floor=0.0005), 0.0005)
-    apart = find_witness(loop, ("x",)).proof.inter_event
-    assert apart is not None
-    assert float(apart) > 0.02
+def test_both_parts_of_a_bound_count_in_units_of_their_thresholds() -> None:
+    """Of 0.05 and 0.0005. In one unit the second part counts for nothing, and is 31 of its thresholds.
 
-
-def test_both_parts_of_a_bound_of_the_controllers_error_are_some_thresholds() -> None:
-    """Of 0.05 and 0.0005. In one unit the second part counts for nothing, and is 31 of its thresholds."""
+    So a disturbance shortens the time between events as little as possible.
+    """
     loop = pushed(double_integrator(floor=0.0005), 0.0005)
-    by_forms = next(bound for bound in find_witness(loop, ("e_c",)).proof.bounds if bound.output == "e_c")
+    proof = find_witness(loop, ("e_c",)).proof
+    by_forms = next(bound for bound in proof.bounds if bound.output == "e_c")
     assert by_forms.decaying < 10 * 0.05
     assert by_forms.constant < 10 * 0.0005
+    assert proof.inter_event is not None
+    assert float(proof.inter_event) > 0.02
 
 
 def test_steps_are_improved_where_rounding_errors_end_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -200,14 +200,14 @@ def test_a_witness_proves_nothing_about_another_loop(name: str, change: str) -> 
     loop, witness = base(name)
     other = CHANGES[change](loop)
     with pytest.raises(RejectedError, match=f"^(x|e_c): ({REASONS[change]})"):
-        prove(other, completed(other, witness.document))
+        prove(other, completed(other, witness.document, whole=True))
 
 
 def test_a_longer_dwell_time_and_another_memory_are_rejected() -> None:
     loop, witness = base("dwell")
     longer = loop._replace(times=loop.times._replace(dwell=8 * T))
     with pytest.raises(RejectedError, match=r"^e_c: flow/0 lost, dwells/"):
-        prove(longer, completed(longer, witness.document))
+        prove(longer, completed(longer, witness.document, whole=True))
     loop, witness = base("dynamic")
     memory = loop.rule.memory
     assert memory is not None

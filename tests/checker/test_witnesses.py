@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
-from noack_check.balls import matrix, number
+from noack_check.balls import is_zero, matrix, number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop, Times
 from noack_check.proof import prove
@@ -85,7 +85,8 @@ CHANGES: dict[str, tuple[Callable[[Loop], Loop], str]] = {
 def test_a_witness_proves_nothing_about_another_loop(witness: Proved, change: str) -> None:
     apply, reason = CHANGES[change]
     loop = apply(double_integrator())
-    for signal in (0.0, 1e-6, 1e-3, 1.0):
+    has_signals = loop.sizes or not is_zero(loop.half_B)
+    for signal in (0.0, 1e-6, 1e-3, 1.0) if has_signals else (0.0,):
         document = (
             witness.document if reason.startswith("^rate") else completed(loop, witness.document, signal)
         )
@@ -151,7 +152,7 @@ def test_an_output_is_bounded_more_tightly_than_by_the_norm_of_the_state() -> No
     assert sizes["y[0]"] < 0.9 * math.sqrt(2) * sizes["x"]
     assert sizes["y[1]"] < 0.9 * 3 * sizes["x"]
     rng = np.random.default_rng(5)
-    assert not [miss for _ in range(6) for miss in exceeded(loop, witness.proof, rng, 8.0)]
+    assert not [miss for _ in range(3) for miss in exceeded(loop, witness.proof, rng, 8.0)]
     entry = next(e for e in witness.document["bounds"] if e["output"] == "y[1]")
     with pytest.raises(RejectedError, match=r"y\[2\]"):
         prove(loop, {**witness.document, "bounds": [{**entry, "output": "y[2]"}]})

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.noack.core.test_extension_points import install, run
+from tests.helpers.installed_packages import install, run
 
 COMMAND = """
 from typing import Annotated

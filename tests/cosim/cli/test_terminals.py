@@ -47,7 +47,8 @@ def test_a_closed_pipe_does_not_change_the_exit_status(
     )  # fmt: skip
     os.close(writing)
     assert process.returncode == status
-    assert status or process.stderr == b""
+    complaints = [line for line in process.stderr.splitlines() if not line.endswith(b" s")]  # no progress
+    assert status or complaints == []
 
 
 @pytest.mark.parametrize(("line_buffering", "write_through"), [(True, False), (False, True)])

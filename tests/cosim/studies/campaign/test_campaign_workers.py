@@ -18,7 +18,7 @@ from cosim.studies.campaign.campaign_workers import LostWorkersError, cluster_ru
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from noack.core.errors import CallerError, PeerError
 from tests.cosim.studies.campaign.conftest import Command, Write, few_of
-from tests.cosim.studies.campaign.test_chunk_store import files
+from tests.helpers.campaign_files import files
 from tests.helpers.live_runs import command_of
 from tests.helpers.waiting import wait_for
 

@@ -17,11 +17,7 @@ from cosim.studies.campaign.chunk_store import Chunk, Store, locked_folder, run_
 from noack.core import file_access
 from noack.core.errors import CallerError, MachineError
 from tests.cosim.studies.campaign.conftest import Few, Write, few_of
-
-
-def files(folder: Path) -> dict[str, int]:
-    """Parquet files and their modification times."""
-    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*.parquet")}
+from tests.helpers.campaign_files import files
 
 
 def test_every_chunk_contains_its_draws_and_their_axis_values(full: Store, campaign: Few) -> None:
