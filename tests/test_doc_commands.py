@@ -34,6 +34,8 @@ def words_of(command: str) -> list[str]:
     return words
 
 
+WRITING = ("--out", "--write")
+"""Options by which another command writes a file that a command reads."""
 COMMANDS = sorted({command for page in PAGES for command in documented(page)})
 OF_NOACK = [command for command in COMMANDS if command.startswith("noack ")]
 RUN = {words_of(command)[0]: command for command in reversed(OF_NOACK) if "--help" not in command}
@@ -67,9 +69,10 @@ def test_a_command_line_is_understood_and_its_scenario_resolved(
     given = parsed(words)
     if words[0] == "netem":
         assert invoke(*words).exit_code == 0
-    elif any(f"--out {given.get('scenario')}" in other for other in OF_NOACK):
-        pass  # another command writes this scenario
-    elif isinstance(given.get("scenario"), str) and not Path(given["scenario"]).is_dir():
+        return
+    files = [str(given[key]) for key in ("scenario", "network") if given.get(key) is not None]
+    is_written = any(f"{way} {file}" in other for file in files for other in OF_NOACK for way in WRITING)
+    if isinstance(given.get("scenario"), str) and not Path(files[0]).is_dir() and not is_written:
         resolve_run(options.load_scenario(given["scenario"], given.get("settings"), given.get("network")))
 
 
@@ -87,10 +90,12 @@ SHORTER = {
 
 
 def shorter(words: list[str]) -> list[str]:
-    more = ("--effort", "5") if "--effort" in words else SHORTER.get(words[0], ())
-    more = ("--figure", "errors") if "pdf" in words else more
+    more = list(("--effort", "5") if "--effort" in words else SHORTER.get(words[0], ()))
+    more = ["--figure", "errors"] if "pdf" in words else more
     if "horizon_s" in " ".join(words) and words[0] != "adversary":
         more = more[:1]
+    for option in ({*more} & {*words}) - {"--set"}:  # it is given once
+        words = words[: words.index(option)] + words[words.index(option) + 2 :]
     return [*words, *more]
 
 

@@ -86,6 +86,7 @@ WITHOUT_EXAMPLE = {"__version__", "ExportedRun", "follow"}
 EXAMPLES = sorted({*noack.__all__, *noack._NOT_IN_STAR} - WITHOUT_EXAMPLE)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_the_examples_of_the_docstrings_run(name: str) -> None:
     (example,) = doctest.DocTestFinder(recurse=False).find(getattr(noack, name), name, module=False, globs={})

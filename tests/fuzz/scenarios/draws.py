@@ -23,9 +23,12 @@ NEVER_DRAWN: Mapping[str, str] = {
     "PythonControllerSettings.sha256": "the user's own copy in a run directory",
     "PythonPlantSettings.sha256": "the user's own copy in a run directory",
     "PythonTriggerSettings.sha256": "the user's own copy in a run directory",
-    "PythonControllerSettings.setpoint": "refused: it needs u = K x_c",
+    "PythonControllerSettings.setpoint": "what the loop follows is up to the user's class",
     "PythonControllerSettings.update_timeout_s": "refused: it needs u = K x_c",
-    "PythonControllerSettings.reference": "refused: it needs u = K x_c",
+    "PythonControllerSettings.reference": "what the loop follows is up to the user's class",
+    "KalmanSettings.gains": "of resolved scenarios",
+    "LyapunovSettings.P": "of resolved scenarios",
+    "DynamicSettings.P": "of resolved scenarios",
     **dict.fromkeys(
         (f"SolutionSegment.{key}" for key in SolutionSegment.model_fields), "what a resolved scenario has"
     ),
@@ -133,6 +136,7 @@ def _certificate(of: Chances) -> Table:
         "late_periods": of.integer(0, 5),
         "network_delay_s": of.between(0.0, 0.2),
         "exceedance_probability": of.size(1e-9, 1e-2),
+        "paper": of.chance(0.5),
     }
     return {"prove": of.chance(0.05), **_some(of, table)}  # the search of a proof takes seconds
 

@@ -142,7 +142,7 @@ def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
         "cart_pole",
         pytest.param("quadrotor", marks=pytest.mark.deep),  # takes a minute
         pytest.param("dc_motor", marks=pytest.mark.deep),
-        "four_tank",
+        pytest.param("four_tank", marks=pytest.mark.deep),
         "unstable_pendulum",
     ],
 )
@@ -179,6 +179,7 @@ def test_a_loop_that_is_not_certified_with_the_fewest_losses_is_not_tried_with_m
     assert len(set(tried)) == 3 * 2 * 2
 
 
+@pytest.mark.deep
 def test_a_run_lasts_until_its_guarantee_has_begun() -> None:
     made = noack.new(noack.gain("unstable_pendulum"), "made.toml", allowed={"angle": 0.003})
     begins = re.search(r"from ([\d.]+) s on", made.guarantee)
@@ -291,6 +292,7 @@ def test_another_rule_is_given_as_a_whole_table() -> None:
     assert made.scenario.trigger.policy == "periodic"
 
 
+@pytest.mark.deep
 def test_dry_friction_is_left_out_of_the_model_and_kept_in_the_guarantee() -> None:
     """Its tanh is steep for the speeds of the loop; the class of the readme uses math."""
     (code,) = blocks("README.md", "python")
@@ -312,6 +314,7 @@ def test_dry_friction_is_left_out_of_the_model_and_kept_in_the_guarantee() -> No
         assert np.abs(np.array(rows["angle"])[late]).max() <= 0.02
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize(("effect", "unit"), [(2.5, 1.0), (0.02, 1000.0)])
 def test_units_of_inputs_and_states_do_not_matter(effect: float, unit: float) -> None:
     """A torque in N m, or degrees and a current in mA, instead of a voltage with effect 20 and radians."""
@@ -328,6 +331,7 @@ def test_units_of_inputs_and_states_do_not_matter(effect: float, unit: float) ->
     assert re.fullmatch(rf"{start}2\.\d+ s on, although up to 4 .* \(proved\)", made.guarantee)
 
 
+@pytest.mark.deep
 def test_an_input_that_is_used_little_is_said_to_be_so() -> None:
     hint = "noack gain pole.py:Heavy --r R --out gain.json, R below 1; noack new gain.json."
     assert noack.new("pole.py:Heavy", "heavy.toml").notes[-1].endswith(hint)
