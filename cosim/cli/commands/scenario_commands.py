@@ -85,7 +85,7 @@ def check(
 ) -> None:
     """Check a scenario and print it with all defaults and random draws filled in.
 
-    The output is a scenario file. Comments at its end say which of the paper's assumptions hold.
+    The output is a scenario file. Comments at its end say which assumptions hold.
 
     A nonlinear plant is also started and linearised. For a plant in Python this runs its code.
     """
