@@ -8,9 +8,13 @@ from noack.scenario.toml_file import read
 
 
 def shipped(name: str, *settings: str) -> Scenario:
-    """Return a shipped scenario with settings; with another model its outputs are the states."""
+    """Return a shipped scenario with settings, of which a later one replaces an earlier one.
+
+    With another model its outputs are the states.
+    """
     path = find_shipped(name, "scenarios")
-    content, given = read(path, Scenario), settings_of(settings)
+    content = read(path, Scenario)
+    given = [pair for setting in settings for pair in settings_of([setting])]
     if "model" in dict(given):
         content.pop("outputs", None)
     return completed_with(content, given, path, "--set ")
