@@ -68,10 +68,12 @@ void *zeros_in_lines(int64_t count, size_t size, void **memory);
 
 /* A stage's memory of a flow. */
 typedef struct {
-    int64_t state;          /* of a Markov chain, or 1: a score is stored */
-    int64_t taken_until_ns; /* the slots of a schedule that begin before this time are taken */
-    double score;           /* of the packet before */
-    int64_t delayed;        /* reorder: packets since the last one that left at once */
+    int64_t state; /* of a Markov chain, or 1: a score is stored */
+    /* the slots of a schedule that begin before this time are taken; of an ordered delay, when the
+       last packet has passed it */
+    int64_t taken_until_ns;
+    double score;    /* of the packet before */
+    int64_t delayed; /* reorder: packets since the last one that left at once */
 } noack_stage_memory;
 
 /* A stage's state that all flows share: of a queue, whose departure times lie in a ring, or of a

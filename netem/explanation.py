@@ -17,6 +17,7 @@ from noack.core.errors import shortened
 from noack.impairments.burst_prediction import BurstPrediction, caps_with, chance_text, predict_bursts
 from noack.impairments.feature import Impairment
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import order_and_notes
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import expected_loss, loss_process, with_target_loss
 from noack.impairments.words import percent_text
@@ -53,7 +54,7 @@ def explain(
             }
             for spec in specs
         ]
-        print(json.dumps({"links": links}, indent=2))
+        print(json.dumps({"links": links}))
         return
     console = SafeConsole(highlight=False)
     for number, (spec, written_spec) in enumerate(zip(specs, as_written, strict=True)):
@@ -81,6 +82,8 @@ def _document(settings: LinkSettings, packets: int) -> dict[str, object]:
         "predicted_loss_note": prediction.note,
         "predicted_loss_without_cap": expected_loss(_without_guarantee(settings)).rate,
         "predicted_bursts_without_cap": _bursts(settings, packets).to_json(),
+        "predicted_mean_burst": _mean_burst(settings),
+        "order": order_meaning(settings),
         "tc": tc.words,
         "tc_lacks": list(tc.lacks),
         "tc_notes": list(tc.notes),
@@ -126,7 +129,9 @@ def _print_direction(
     console.print(Text(f"{title}, in this order", "bold"))
     console.print(_table(settings, written, console.width))
     console.print(Text(f"\nexpected loss rate: {_rate_text(settings)}"))
-    _print_bursts(console, _bursts(settings, packets))
+    _print_bursts(console, _bursts(settings, packets), _mean_burst(settings))
+    if order := order_meaning(settings):
+        console.print(Text(f"order: {order}"))
     _print_tc(console, tc_command(settings, written))
 
 
@@ -168,14 +173,40 @@ def _bursts(settings: LinkSettings, packets: int) -> BurstPrediction:
     return predict_bursts(process, caps_with(settings.longest_burst), packets)
 
 
-def _print_bursts(console: Console, bursts: BurstPrediction) -> None:
+def _mean_burst(settings: LinkSettings) -> float | None:
+    """Return the mean loss burst under the guarantee; None: it is not known, or there is no guarantee."""
+    if not settings.guarantee.rules:
+        return None
+    try:
+        return loss_process(settings).outcomes(settings.guarantee).mean_burst
+    except NotPredictableError:
+        return None
+
+
+def order_meaning(settings: LinkSettings) -> str:
+    """Return what delays do to the order of packets, and to the guarantee; empty: nothing is delayed."""
+    order, _ = order_and_notes(settings)
+    if not order.delayed:
+        return ""
+    if not order.reordered:
+        return "each flow leaves in the order of its arrival"
+    overtaken = "delays vary, so packets may overtake earlier ones, which are then stale: lost for a receiver"
+    if settings.guarantee.rules:
+        effect = "the guarantee counts stale packets as lost, and holds packets back that would make too many"
+    else:
+        effect = "without a guarantee nothing limits how many in a row"
+    return f"{overtaken} that uses the newest; {effect}; the word ordered after a delay keeps the order"
+
+
+def _print_bursts(console: Console, bursts: BurstPrediction, with_cap: float | None) -> None:
     if not bursts.chance:
         console.print(Text(f"loss bursts without a cap: not known: {bursts.note}"))
         return
     if not any(bursts.chance.values()):
         return
     mean = f"{bursts.mean_burst:.3g} packets long on average" if bursts.mean_burst else "endless"
-    console.print(Text(f"loss bursts without a cap: {mean}"))
+    behind = "" if with_cap is None else f"; with the guarantee {with_cap:.3g}"
+    console.print(Text(f"loss bursts without a cap: {mean}{behind}"))
     console.print(
         Text(f"chance that within {bursts.packets} packets one is longer than M − 1, without a cap:")
     )
@@ -248,6 +279,8 @@ def tc_command(settings: LinkSettings, written: LinkSettings | None = None) -> T
     for impairment, words in expressible:
         if share := getattr(impairment, "loss_correlation", 0.0):
             lacks.append(f"lossrel {percent_text(share)} (a delay correlated with loss)")
+        if getattr(impairment, "ordered", False):
+            lacks.append("ordered (that jitter keeps the order)")
         lack = impairment.tc_lacks(supported)
         if any(earlier.kind == impairment.kind for earlier in supported):
             lack = f"a second {impairment.kind}"

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
-from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_links import STREAM, LinkSpec
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
@@ -35,7 +35,7 @@ class LinkTable(ScenarioSection):
     """One link of a relay: its addresses, and its settings in each direction."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
-    """Names the link in reports, and its random streams: letters, digits, _ and -."""
+    """Names the link in reports: letters, digits, _ and -."""
     listen: str
     """Where clients send to: HOST:PORT; port 0 takes a free one."""
     to: str
@@ -46,8 +46,8 @@ class LinkTable(ScenarioSection):
     """From the server to the clients: words or a table, as for forward."""
     words: Side | None = None
     """Another name for forward."""
-    seed: Seed = 0
-    """Seed of the link's random streams."""
+    seed: Seed | None = None
+    """Seed of the link's random streams; by default 0, with other random numbers for each link."""
     return_path: bool = True
     """false: forward direction only; the server's answers are discarded."""
     idle_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] = LinkSpec.idle_s
@@ -61,7 +61,7 @@ class LinkTable(ScenarioSection):
             raise ValueError("words: is short for forward; give one of them")
         return self
 
-    def spec(self, folder: Path, place: str, *, read: bool = True) -> LinkSpec:
+    def spec(self, folder: Path, place: str, number: int, *, read: bool = True) -> LinkSpec:
         """Return the link for a relay; resolves its addresses, and reads its files in a folder.
 
         Raises:
@@ -77,7 +77,9 @@ class LinkTable(ScenarioSection):
             to=parse_destination(self.to, f"{place}.to", listen),
             forward=forward,
             reverse=reverse,
-            **self.model_dump(include={"name", "seed", "return_path", "idle_s", "most_clients"}),
+            seed=self.seed or 0,
+            stream=f"{STREAM} {number + 1}" if number and self.seed is None else STREAM,
+            **self.model_dump(include={"name", "return_path", "idle_s", "most_clients"}),
         )
 
 
@@ -109,7 +111,8 @@ def load_links(path: Path, *, read: bool = True) -> tuple[LinkSpec, ...]:
         raise CallerError(f"{path}: a {kind}, not a file of links; it has no [[link]]")
     links = toml_file.validated(LinksFile, content, str(path)).link
     specs = tuple(
-        link.spec(path.parent, f"{path}: link.{number}", read=read) for number, link in enumerate(links)
+        link.spec(path.parent, f"{path}: link.{number}", number, read=read)
+        for number, link in enumerate(links)
     )
     listening: dict[object, str] = {}
     for number, spec in enumerate(specs):

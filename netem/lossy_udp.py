@@ -30,9 +30,10 @@ class LossyUdp:
     """A UDP relay to a server, which delays and loses datagrams, within the limits that its words set.
 
     Clients send to ``address`` instead of to the server. A datagram's fate depends on ``seed``,
-    ``name``, the direction, the number of the client (in the order in which clients appear) and the
-    number of the datagram within its flow; so a program that sends the same datagrams meets the
-    same losses again. How many datagrams a program sends may depend on its timers.
+    the direction, the number of the client (in the order in which clients appear) and the number of
+    the datagram within its flow; so a program that sends the same datagrams meets the same losses
+    again, here, from ``noack netem`` and from a file of links. How many datagrams a program sends
+    may depend on its timers.
 
     >>> import noack
     >>> with noack.LossyUdp("127.0.0.1:9", "loss 30% mansd 4", seed=1) as link:
@@ -47,7 +48,7 @@ class LossyUdp:
         reverse: what happens to the server's answers; nothing by default.
         seed: seed of the random streams.
         listen: where clients send to; port 0 selects a free port.
-        name: name of the link, and part of the names of its random streams.
+        name: name of the link in reports.
 
     Raises:
         CallerError: an address or a word is wrong; the listening address is in use (on entering).

@@ -66,7 +66,9 @@ def lossy_udp(request: pytest.FixtureRequest) -> Iterator[Callable[..., LossyUdp
             seed: int | None = None,
             listen: str | Sequence[str | int] = "127.0.0.1:0",
         ) -> LossyUdp:
-            link_seed, name = common if seed is None else seed, f"link {len(links) + 1}"
+            # Each link has a seed of its own, so that links with the same words differ.
+            link_seed = (common + len(links)) % 2**64 if seed is None else seed
+            name = f"link {len(links) + 1}"
             link = LossyUdp(to, words, reverse=reverse, seed=link_seed, listen=listen, name=name)
             links.append(stack.enter_context(link))
             return link

@@ -93,7 +93,7 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
 def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
     """Print the totals of a relay that has ended."""
     if options.json:
-        print(json.dumps(totals, indent=2))
+        print(json.dumps(totals))
     logged = log_event("info", "noack netem", "ended", event="totals", totals=totals)
     if not (options.json or logged):
         for line in statistics_lines(totals):

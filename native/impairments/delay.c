@@ -62,5 +62,10 @@ static int64_t draw_delay_ns(
 void apply_delay(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     double uniform[2];
     draw(packet, stage, 0, uniform);
-    copy_in(packet)->time_ns += draw_delay_ns(&stage->delay, packet, memory, uniform[0]);
+    packet_copy *copy = copy_in(packet);
+    copy->time_ns += draw_delay_ns(&stage->delay, packet, memory, uniform[0]);
+    if (stage->delay.ordered && copy->exists) {
+        copy->time_ns = max_of(copy->time_ns, memory->taken_until_ns);
+        memory->taken_until_ns = copy->time_ns;
+    }
 }

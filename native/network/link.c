@@ -98,7 +98,7 @@ static void apply_stages(packet *packet, noack_stage_memory *memory) {
             noack_stage_memory latest = *memory;
             packet->copy = DUPLICATE;
             APPLY[stage->kind](packet, stage, memory);
-            latest.taken_until_ns = memory->taken_until_ns; /* it has taken a slot */
+            latest.taken_until_ns = memory->taken_until_ns; /* it has taken a slot, or passed */
             *memory = latest;
         }
     }

@@ -139,6 +139,7 @@ typedef struct {
     int64_t begin, end; /* empirical quantiles in ns, a range of the table of reals */
     double correlation, innovation;
     double loss_correlation, loss_innovation;
+    int64_t ordered; /* 1: no packet passes before an earlier one of its flow */
 } noack_delay;
 
 /* A trace of delivery opportunities: times in ms, a range of the table of integers; they repeat

@@ -18,7 +18,8 @@ from netem.relay.relay_reports import DIRECTIONS, Direction, LinkReport
 from netem.tc_words import words_of
 from noack.core.errors import PeerError
 from noack.impairments.link_settings import Counters, LinkSettings
-from noack.impairments.target_loss import expected_loss
+from noack.impairments.markov_chain import NotPredictableError
+from noack.impairments.target_loss import expected_loss, loss_process
 
 T = TypeVar("T")
 
@@ -42,6 +43,14 @@ class AppliedSettings:
     def predicted_loss(self) -> float | None:
         """See :mod:`noack.impairments.loss_prediction`; this may take seconds."""
         return expected_loss(self.settings).rate
+
+    @cached_property
+    def loss_variance(self) -> float | None:
+        """Variance of the number of losses among n packets, divided by n; None: it is not known."""
+        try:
+            return loss_process(self.settings).outcomes(self.settings.guarantee).variance
+        except NotPredictableError:
+            return None
 
 
 class Snapshot(NamedTuple):

@@ -144,7 +144,7 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
     with Client(name) as client:
         statistics = client.ask("report")
     if options.json:
-        print(json.dumps(statistics, indent=2), flush=True)
+        print(json.dumps(statistics), flush=True)
     else:
         _print_lines(statistics)
     return ExitStatus.OK
@@ -178,7 +178,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
             settings=settings.model_dump(mode="json"),
         )
     if options.json:
-        print(json.dumps(answer, indent=2), flush=True)
+        print(json.dumps(answer), flush=True)
         return ExitStatus.OK
     for link in answer["links"]:
         for direction in DIRECTIONS:

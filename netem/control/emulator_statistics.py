@@ -5,6 +5,7 @@ none. Counts are totals since the relay started; ``recent`` covers the time sinc
 document. :class:`StatisticsThread` passes documents to a consumer at intervals.
 """
 
+import math
 import threading
 import time
 from collections import deque
@@ -31,6 +32,8 @@ from noack.impairments.link_settings import Counters
 from noack.protocol.record_tables import Fate
 from noack.runtime.address import address_text
 
+_Z = 1.959963984540054
+"""Quantile of the normal distribution for a 95 % interval."""
 _MAX_WORDS = 200
 """Longer settings are cut to this number of characters."""
 
@@ -53,6 +56,8 @@ class LossStatistics(TypedDict):
     """Share without an intact forwarded copy."""
     drawn: float | None
     """Share dropped or corrupted by a random draw, not by a full queue or a blackout."""
+    drawn_interval: list[float] | None
+    """95 % interval of the rate that ``drawn`` measures, by the predicted correlation of the losses."""
     predicted: float | None
     """Expected value of ``drawn``; see :mod:`noack.impairments.loss_prediction`."""
 
@@ -203,6 +208,9 @@ def _direction(
             "realised": loss_share(new),
             "lost": _share(new, new.dropped + new.corrupted + new.overflowed + new.blacked_out),
             "drawn": _share(new, new.dropped + new.corrupted),
+            "drawn_interval": rate_interval(
+                new.dropped + new.corrupted, new.received, applied.loss_variance, applied.predicted_loss
+            ),
             "predicted": applied.predicted_loss,
         },
         "unintended": dict(report.unintended),
@@ -248,6 +256,27 @@ def loss_share(counters: Counters) -> float | None:
     """
     effective = counters.delivered + counters.forced - counters.delivered_out_of_order
     return _share(counters, min(max(counters.received - effective, 0), counters.received))
+
+
+def rate_interval(
+    lost: int, packets: int, variance: float | None, predicted: float | None
+) -> list[float] | None:
+    """Return the 95 % interval of a loss rate (Wilson, 1927); None without packets.
+
+    Args:
+        lost: lost packets.
+        packets: packets.
+        variance: of the number of losses among n packets, divided by n; None: as independent losses.
+        predicted: the loss rate to which it belongs.
+    """
+    if not packets:
+        return None
+    count, share = float(packets), lost / packets
+    if variance and predicted and 0 < predicted < 1:
+        count *= predicted * (1 - predicted) / variance  # so many independent packets say as much
+    middle = (share + _Z**2 / (2 * count)) / (1 + _Z**2 / count)
+    half = _Z / (1 + _Z**2 / count) * math.sqrt(share * (1 - share) / count + _Z**2 / (4 * count**2))
+    return [max(middle - half, 0.0), min(middle + half, 1.0)]
 
 
 def _share(counters: Counters, lost: int) -> float | None:

@@ -90,8 +90,11 @@ def _loss_text(side: DirectionStatistics) -> str:
 
 def _drawn_text(side: DirectionStatistics) -> str:
     drawn, predicted = side["loss"]["drawn"], side["loss"]["predicted"]
-    expected = "" if predicted is None else f", predicted {percent_text(predicted)}"
-    return percent_text(drawn) + expected
+    interval = side["loss"]["drawn_interval"]
+    if predicted is None or interval is None:
+        return percent_text(drawn)
+    low, high = map(percent_text, interval)
+    return f"{percent_text(drawn)} (95 %: {low} to {high}), predicted {percent_text(predicted)}"
 
 
 def _lost_text(side: DirectionStatistics) -> str:

@@ -55,10 +55,27 @@ def listen(title: str, name: SocketName) -> Endpoint:
     Raises:
         CallerError: the address cannot be bound.
     """
+    if ip_address(name[0].partition("%")[0]).is_multicast:
+        raise CallerError(f"{title}: a multicast address; clients send to an address of this machine")
+    if _is_broadcast(name):
+        raise CallerError(f"{title}: a broadcast address; clients send to an address of this machine")
     endpoint = _udp_socket(name)
     bind_to(endpoint, name, title, "listen on another, or on port 0 for any")
     _prepare(endpoint)
     return endpoint
+
+
+def _is_broadcast(name: SocketName) -> bool:
+    """Return whether an address is that of all hosts of a network.
+
+    The system knows the networks: it does not connect a socket to such an address without leave.
+    """
+    with _udp_socket(name) as probe:
+        try:
+            probe.connect((name[0], 9, *name[2:]))
+        except OSError as error:
+            return error.errno == errno.EACCES
+    return False
 
 
 def return_path(server: SocketName) -> tuple[Endpoint | None, int]:

@@ -67,7 +67,7 @@ class Relay:
             RelayDirection(
                 getattr(spec, side),
                 spec.seed,
-                (spec.name, side),
+                (spec.stream, side),
                 self._memory.core.directions[2 * number + reverse],
             )
             for number, spec in enumerate(self.specs)

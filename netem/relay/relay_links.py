@@ -25,12 +25,16 @@ _GET_INTERFACE, _REQUEST_BYTES = 0x800454D2, 40
 """Request of ioctl TUNGETIFF, and the size of what it fills in, which begins with the name."""
 
 
+STREAM = "relay"
+"""Name of a link's random streams, whatever its own name: fates depend on its words and its seed alone."""
+
+
 @dataclass(frozen=True)
 class LinkSpec:
     """One link of a relay."""
 
     name: str
-    """Name of the link; part of the names of its random streams."""
+    """Name of the link in reports."""
     listen: Address
     """The address to which clients send; port 0 selects a free port."""
     to: Address
@@ -42,6 +46,8 @@ class LinkSpec:
     """False: forward only; all datagrams leave from one socket, and answers are discarded."""
     idle_s: float = 60.0
     """A client without a datagram in either direction for this time is removed."""
+    stream: str = field(default=STREAM, compare=False)
+    """Name of its random streams; another one for a further link of a file without a seed of its own."""
     most_clients: int = 65_536
     """Maximum number of clients; datagrams of further clients are refused and counted."""
 

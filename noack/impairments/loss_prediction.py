@@ -321,6 +321,25 @@ class OutcomeChain(NamedTuple):
     lost: Array  # (n, n) Probabilities of a step whose packet is lost
     delivered: Array  # (n, n) The same of a delivery; both together are a stochastic matrix
 
+    @property
+    def mean_burst(self) -> float | None:
+        """The mean number of consecutive losses; None: losses never begin, or never end."""
+        distribution = self.distribution()
+        lost, begins = (distribution @ self.lost).sum(), (distribution @ self.delivered @ self.lost).sum()
+        return float(lost / begins) if begins > 0 else None
+
+    @property
+    def variance(self) -> float:
+        """The variance of the number of losses among many packets, divided by their number."""
+        transitions, distribution = self.lost + self.delivered, self.distribution()
+        rate = float((distribution @ self.lost).sum())
+        count = len(distribution)
+        # The correlation of a loss with all later ones, by the fundamental matrix (Kemeny and Snell).
+        fundamental = np.linalg.pinv(np.eye(count) - transitions + np.outer(np.ones(count), distribution))
+        deviation = self.lost.sum(axis=1) - rate
+        after_loss = distribution @ self.lost - rate * distribution
+        return float(max(rate * (1 - rate) + 2 * after_loss @ fundamental @ deviation, 0.0))
+
     def after_pause(self) -> "OutcomeChain":
         """Return the chain of a sensor that does not transmit at its first time, as if lost."""
         lost, delivered = np.pad(self.lost, (0, 1)), np.pad(self.delivered, (0, 1))

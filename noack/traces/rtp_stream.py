@@ -1,8 +1,8 @@
 """RTP streams in a capture (RFC 3550): their synchronisation source, sequence numbers and timestamps.
 
 A flow is a stream of RTP if nearly all of its datagrams have an RTP header of one source (SSRC), whose
-sequence numbers are near those before them and whose timestamps do not stand still. Timestamps say when the sender took
-what it sent, also if it pauses or sends several packets for one picture.
+sequence numbers are near those before them, and whose timestamps do not stand still. Timestamps say when
+the sender took what it sent, also if it pauses or sends several packets for one picture.
 """
 
 from typing import NamedTuple

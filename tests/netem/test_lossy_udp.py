@@ -1,5 +1,7 @@
 """The emulator within a program, and the plug-in of pytest."""
 
+import json
+import signal
 import socket
 import subprocess
 import sys
@@ -14,6 +16,7 @@ import pytest
 import noack
 from netem import pytest_plugin
 from netem.link_state import LinkState
+from netem.links_file import load_links
 from netem.tc_words import settings_of
 from noack.core.errors import NoackError
 from tests.helpers.pages import blocks
@@ -161,3 +164,42 @@ def test_the_test_of_the_documentation_passes(tmp_path: Path) -> None:
     (tmp_path / "test_repeating_client.py").write_text(program)
     done = run_pytest(tmp_path, "-q")
     assert done.returncode == 0, done.stdout
+
+
+def arrived_through(ends: Ends, *arguments: str, count: int = 60) -> list[bool]:
+    """Return which datagrams arrive through ``noack netem`` with options."""
+    command = [sys.executable, "-m", "netem", *arguments, "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        listen = json.loads(process.stdout.readline())["ready"][-1]["listen"]
+        host, _, port = listen.rpartition(":")
+        for number in range(count):
+            ends.client.sendto(number.to_bytes(4), (host, int(port)))
+        received: list[int] = []
+        for _ in range(4):  # at most three of them are lost
+            ends.client.sendto(b"last", (host, int(port)))
+        while (data := ends.server.recv(4)) != b"last":
+            received.append(int.from_bytes(data))
+        process.send_signal(signal.SIGINT)
+        (line,) = process.communicate(timeout=60)[0].splitlines()
+        assert json.loads(line)["links"][-1]["forward"]["received"] == count + 4
+    return [number in received for number in range(count)]
+
+
+def test_words_and_seed_give_the_same_fates_everywhere(ends: Ends, tmp_path: Path) -> None:
+    """In a program, on the command line, and in a file, whatever the link's name and place are there."""
+    words = "loss 50% mansd 3"
+    to = "{}:{}".format(*ends.server.getsockname())
+    expected = arrived(ends, words, 7, 60)
+    last = [*words.split(), "--seed", "7"]
+    assert arrived_through(ends, "--listen", ":0", "--to", to, *last) == expected
+    links = tmp_path / "links.toml"
+    other = f'[[link]]\nname = "other"\nlisten = ":0"\nto = "{to}"\nwords = "{words}"\n'
+    links.write_text(f"{other}{other.replace('other', 'uplink')}seed = 7\n")
+    assert arrived_through(ends, "--links", str(links)) == expected
+    first, second = load_links(links)
+    assert (first.seed, second.seed) == (0, 7)
+    assert first.stream == second.stream
+    links.write_text(other + other.replace("other", "uplink"))
+    first, second = load_links(links)
+    assert first.stream != second.stream  # with the same words, but no seed, their fates differ

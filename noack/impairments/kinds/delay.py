@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core, ffi
 from noack.core.periods import exact_ns
-from noack.impairments.clauses import Clause, Part, Word
+from noack.impairments.clauses import Clause, Part, Word, flag
 from noack.impairments.feature import (
     TC_CORRELATION,
     FileFeature,
@@ -124,6 +124,8 @@ class Delay(FileFeature, Impairment):
     loss_correlation: Annotated[FiniteFloat, Field(ge=-1, le=1)] = 0.0
     """Correlation with the preceding loss model: positive values delay packets in its bad state
     more."""
+    ordered: bool = False
+    """true: no packet of a flow passes before an earlier one; it waits for it."""
 
     clauses: ClassVar = (
         Clause(
@@ -148,6 +150,7 @@ class Delay(FileFeature, Impairment):
                 {"distribution": "empirical"},
             ),
             Part("loss_correlation", SIGNED_PERCENT, "P", "lossrel", "loss 5% delay 10ms 2ms lossrel 50%"),
+            flag("ordered", "delay 10ms 2ms ordered", "ordered", True),
             synonyms=("latency",),
         ),
     )
@@ -179,7 +182,7 @@ class Delay(FileFeature, Impairment):
 
     def order_after(self, before: PacketOrder) -> PacketOrder:
         delayed = before.delayed or not self.is_constant or self.delay_s > 0
-        return PacketOrder(delayed, before.reordered or not self.is_constant)
+        return PacketOrder(delayed, not self.ordered and (before.reordered or not self.is_constant))
 
     def meaning(self) -> str:
         text = f"delays each packet by {time_text(self.delay_s)}"
@@ -203,6 +206,8 @@ class Delay(FileFeature, Impairment):
             text += f"; correlation {brief_percent(self.correlation)}"
         if self.loss_correlation:
             text += f"; correlation {brief_percent(self.loss_correlation)} with the loss before it"
+        if self.ordered:
+            text += "; keeps the order of each flow"
         return text
 
     def _share_below_zero(self) -> float:
@@ -239,6 +244,7 @@ class Delay(FileFeature, Impairment):
             "innovation": math.sqrt(1 - self.correlation**2),
             "loss_correlation": self.loss_correlation,
             "loss_innovation": math.sqrt(1 - self.loss_correlation**2),
+            "ordered": int(self.ordered),
         }
         return Stage(self.kind, numbers)
 
@@ -247,7 +253,7 @@ class Delay(FileFeature, Impairment):
         return self.model_copy(update={"samples_s": samples_s, "file": None, "jitter_s": 0.0})
 
     def tc_text(self) -> str:
-        without = self.model_copy(update={"loss_correlation": 0.0})
+        without = self.model_copy(update={"loss_correlation": 0.0, "ordered": False})
         if self.distribution == "uniform" and not self.jitter_s:
             return f"delay {time_text(self.delay_s)}"
         return without.text()

@@ -32,6 +32,11 @@ class _LossClause(Clause):
             reader.unknown(name, LOSS_WORDS)
         model, clause = _MODELS[name]
         loss = {"model": model.model_fields["model"].default, **clause.read(reader)}
+        if reader.accept("keep"):
+            reader.wrong(
+                "goes with loss P only: the guarantee shortens bursts, so that no chain has a given rate and "
+                "a given burst behind it; --explain shows both"
+            )
         if reader.accept("ecn"):
             reader.wrong("this emulator cannot mark packets: it sees payloads, not IP headers")
         return {"loss": loss}

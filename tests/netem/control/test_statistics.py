@@ -14,7 +14,7 @@ from netem.__main__ import main
 from netem.control import emulator_statistics
 from netem.control.command_queue import AppliedSettings, Snapshot
 from netem.control.control_server import ControlServer
-from netem.control.emulator_statistics import DirectionStatistics, Statistics, statistics
+from netem.control.emulator_statistics import DirectionStatistics, Statistics, rate_interval, statistics
 from netem.control.statistics_text import statistics_lines
 from netem.relay.relay_reports import FlowReport
 from noack.core.clock import NS_PER_S
@@ -135,3 +135,14 @@ def test_the_documented_program_runs(capsys: pytest.CaptureFixture[str]) -> None
         exec(change, {})
     assert capsys.readouterr().out == "None\n"
     assert relay.settings["relay", "reverse"].mansd == 2
+
+
+def test_a_measured_rate_has_an_interval() -> None:
+    """Wilson's for independent losses; wider for bursts, narrower under a cap."""
+    low, high = rate_interval(20, 100, 0.16, 0.2) or ()
+    assert (low, high) == pytest.approx((0.13337, 0.28883), abs=1e-5)  # Wilson (1927)
+    assert rate_interval(20, 100, None, None) == pytest.approx([low, high])
+    wide, narrow = rate_interval(20, 100, 0.5, 0.2) or [], rate_interval(20, 100, 0.02, 0.2) or []
+    assert wide[0] < low < narrow[0] < 0.2 < narrow[1] < high < wide[1]
+    assert rate_interval(0, 0, None, None) is None
+    assert rate_interval(0, 50, 0.0, 0.0) == pytest.approx([0.0, 0.0714], abs=1e-3)

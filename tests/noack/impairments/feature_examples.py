@@ -24,7 +24,7 @@ WORDS = f"""
     delay 500us; delay 4ms 4ms; delay 4ms 4ms distribution normal
     delay 4ms 4ms distribution pareto; delay 4ms 4ms distribution paretonormal
     delay 0s 500us 70%; delay 10ms 10ms distribution normal lossrel 80%
-    delay 0s samples 0s,1ms,2ms,9ms
+    delay 0s samples 0s,1ms,2ms,9ms; delay 4ms 4ms ordered; delay 1ms 9ms 50% distribution normal ordered
     {"; ".join(f"{kind} {chance}" for kind in ("corrupt", "duplicate") for chance in CHANCES)}
     reorder 0%; reorder 50%; reorder 90% gap 2; reorder 100% gap 4; reorder 50% 70% gap 3
     blackout 0s-10ms,20ms-30ms every 50ms; blackout 1ms-20ms; outages 'my outages.txt' every 60s

@@ -181,6 +181,26 @@ def test_lost_packets_are_no_candidates(decide: Any) -> None:
     assert (delays_ns == 0).tolist() == [False, False, True] * 3
 
 
+@pytest.mark.parametrize(
+    "words", ["delay 10ms 10ms", "duplicate 50% delay 0ms 3ms", "loss 50% delay 5ms 5ms 80%"]
+)
+def test_an_ordered_delay_keeps_the_order_of_each_flow(decide: Any, words: str) -> None:
+    """What would be earlier leaves with the packet before it; the longest delay is the same."""
+    flows = np.arange(40_000) % 2
+    free, ordered = (decide(f"{words}{end}", 40_000, flows=flows) for end in ("", " ordered"))
+    assert free.fates.tolist() == ordered.fates.tolist()
+    for flow in (0, 1):
+        times = []
+        for column in ("release_ns", "copy_ns"):
+            times.append(ordered.decisions[column][flows == flow])
+            assert (np.diff(times[-1][times[-1] >= 0]) >= 0).all()
+        if "duplicate" not in words:
+            wanted = free.decisions["release_ns"][flows == flow]
+            kept = wanted >= 0
+            assert times[0][kept].tolist() == np.maximum.accumulate(wanted[kept]).tolist()
+            assert ordered.delays_ns.max() <= free.delays_ns.max()
+
+
 def read_delay(folder: Path, **settings: Any) -> Delay:
     delay = Delay(distribution="empirical", **settings)
     (read,) = read_files(LinkSettings(impairments=(delay,)), folder).impairments

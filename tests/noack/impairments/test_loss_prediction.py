@@ -231,3 +231,29 @@ def test_losses_are_not_predicted_if_few_packets_may_be_delayed_at_once() -> Non
         link.handle(Datagram(0, bytes(72)), t_ns)
         link.on_timer(t_ns)
     assert link.counters.corrupted == pytest.approx(500, abs=60)
+
+
+@pytest.mark.parametrize(
+    ("words", "mean_burst"),
+    [
+        ("loss 30%", 1 / 0.7), ("loss burst 10% 5", 5.0), ("loss worst mansd 4", 4.0),
+        ("loss 50% mansd 2", (0.5 + 0.25) / 0.5), ("loss periodic 7/100 mansd 3", 7 / 2),
+        ("loss burst 20% 4 mansd 3", None), ("loss 40% mansd 2 atmost 2 in 6", None),
+        ("duplicate 50% loss gemodel 5% 20% 80% 2% mansd 4", None),
+    ],
+)  # fmt: skip
+def test_the_bursts_behind_a_guarantee_and_the_spread_of_their_rate(
+    decide: Any, words: str, mean_burst: float | None
+) -> None:
+    """Mean and variance, against closed forms and many decisions in parts."""
+    settings = settings_of(words)
+    outcomes = loss_process(settings).outcomes(settings.guarantee)
+    parts, size = 400, 1000
+    lost = decide(words, parts * size, seed=3).decisions["release_ns"] < 0
+    bursts = np.count_nonzero(lost[1:] & ~lost[:-1])
+    assert outcomes.mean_burst == pytest.approx(np.count_nonzero(lost) / bursts, rel=0.03)
+    if mean_burst is not None and "periodic" not in words:
+        assert outcomes.mean_burst == pytest.approx(mean_burst)
+    # The relative standard error of the variance of 400 parts is 7 %.
+    variance = lost.reshape(parts, size).sum(axis=1).var() / size
+    assert outcomes.variance == pytest.approx(variance, rel=0.35, abs=5e-3)
