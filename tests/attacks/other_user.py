@@ -3,13 +3,20 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
 
 NOBODY = 65534
-needs_root = pytest.mark.skipif(os.getuid() != 0, reason="acts as another user: takes root")
+
+
+def needs_root(test: Callable[..., None]) -> Callable[..., None]:
+    """Mark a test that acts as another user."""
+    return pytest.mark.system(
+        pytest.mark.skipif(os.getuid() != 0, reason="acts as another user: takes root")(test)
+    )
+
 
 _BECOME = """
 import encodings.idna, http.server, os, sys, urllib.error, urllib.request

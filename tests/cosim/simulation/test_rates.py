@@ -67,7 +67,9 @@ def test_a_whole_period_stays_whole() -> None:
         assert period_of(rate_hz).longest_ns == round(1e9 / rate_hz)
 
 
-@pytest.mark.parametrize("number", range(12))
+@pytest.mark.parametrize(
+    "number", [pytest.param(number, marks=pytest.mark.deep if number >= 3 else ()) for number in range(12)]
+)
 def test_random_scenarios_run_as_the_reference_loop(number: int) -> None:
     content = random_scenario(number)
     rng = np.random.default_rng(number)

@@ -189,6 +189,7 @@ def killing(process: "subprocess.Popen[str]", count: int) -> Callable[[int, int]
     return progress
 
 
+@pytest.mark.system
 def test_a_cluster_from_its_first_worker_to_its_end(
     dask: Cluster, tmp_path: Path, write: Write, plan: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
