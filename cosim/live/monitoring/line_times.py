@@ -10,7 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 LINE_EVERY_S = 9.0
-"""Time between two lines; the imports before a command's start take some tenths of a second, too."""
+"""Time between two lines."""
+FIRST_LINE_S = 6.0
+"""Time from a command's start to its first line: the imports before this start take a second or more, too."""
 _last_s = time.monotonic()
 _is_command = False
 
@@ -18,9 +20,9 @@ _is_command = False
 @contextmanager
 def lines_of_command() -> Iterator[None]:
     """Count over all works while this context lasts, from its beginning on."""
-    global _is_command
+    global _is_command, _last_s
     _is_command = True
-    note_line()
+    _last_s = time.monotonic() - (LINE_EVERY_S - FIRST_LINE_S)
     try:
         yield
     finally:

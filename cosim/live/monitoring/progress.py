@@ -129,10 +129,21 @@ def work_bar(description: str, *, lines: bool = False) -> Iterator[Progress]:
 
 @contextmanager
 def simulation_bar(console: Console) -> Iterator[Progress]:
-    """Show the simulated time of a simulation, in seconds."""
+    """Show the simulated time of a simulation, in seconds; where there is no terminal, at intervals."""
     column = TextColumn("{task.completed:.1f}/{task.total:g} s simulated")
-    with _bar(console, 1, column) as update:
-        yield lambda done, total=1.0, /: update(completed=done, total=total)
+    text = "simulating"
+
+    with (
+        _bar(console, 1, column) as update,
+        _line_at_intervals(lambda: text, printed=not console.is_terminal),
+    ):
+
+        def show(done: float, total: float = 1.0, /) -> None:
+            nonlocal text
+            text = f"simulating: {done:.1f} of {total:g} s"
+            update(completed=done, total=total)
+
+        yield show
 
 
 @contextmanager
@@ -146,20 +157,22 @@ def runs_bar(console: Console) -> Iterator[Progress]:
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
-    begin_work()
     before: float | None = None
-    began_s = time.monotonic()
-    with _bar(console, 1, *columns) as show:
+    began_s, runs = time.monotonic(), "starting"
+
+    def line() -> str:
+        return f"{runs}, {time.monotonic() - began_s:.0f} s"
+
+    with _bar(console, 1, *columns) as show, _line_at_intervals(line, printed=not console.is_terminal):
 
         def update(done: float, total: float = 1.0, /) -> None:
-            nonlocal before
+            nonlocal before, runs
             before = done if before is None else before
+            runs = f"{done:,.0f} of {total:,.0f} runs"
             spent_s = time.monotonic() - began_s
             rate = (done - before) / max(spent_s, 1e-3)
             text = f"{rate:,.0f}/s" if done > before else "starting"
             show(completed=done, total=total, rate=text)
-            if not console.is_terminal and until_line_s() <= 0:
-                _print_line(f"{done:,.0f} of {total:,.0f} runs after {spent_s:.0f} s")
 
         yield update
 

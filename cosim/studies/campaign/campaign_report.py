@@ -282,7 +282,7 @@ def finish_campaign(
     _, base = base_of(plan, path)
     store = Store(folder, points, draws, plan.chunk)
     with stop_requests_raised(), locked_folder(plan, base, store):
-        with workers() as runner, bar or nullcontext(no_progress) as progress:
+        with bar or nullcontext(no_progress) as progress, workers() as runner:
             new_runs = run_campaign(store, runner, progress)
         with show("summarising"):
             summary = summarise(plan, store)

@@ -14,21 +14,37 @@ MOST_S = 60.0
 
 @pytest.mark.parametrize(
     "work",
-    [lambda: progress.work_bar("proving", lines=True), lambda: progress.activity("proving")],
-    ids=["work_bar", "activity"],
+    [
+        (lambda: progress.work_bar("proving", lines=True), "proving"),
+        (lambda: progress.activity("proving"), "proving"),
+        (lambda: progress.runs_bar(progress.error_console()), "starting"),
+        (lambda: progress.simulation_bar(progress.error_console()), "simulating"),
+    ],
+    ids=["work_bar", "activity", "runs_bar", "simulation_bar"],
 )
 def test_long_work_is_not_silent_though_it_reports_nothing(
-    work: Callable[[], AbstractContextManager[object]],
+    work: tuple[Callable[[], AbstractContextManager[object]], str],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(line_times, "LINE_EVERY_S", 0.01)
     printed, ends_s = "", time.monotonic() + MOST_S
-    with work():
+    begin, text = work
+    with begin():
         while "\n" not in printed and time.monotonic() < ends_s:
             time.sleep(0.01)
             printed += capsys.readouterr().err
-    assert printed.startswith("noack: proving")
+    assert printed.startswith(f"noack: {text}")
+
+
+def test_the_first_line_of_a_command_is_due_earlier(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The imports before the command's start count for who waits, too."""
+    monkeypatch.setattr(line_times, "LINE_EVERY_S", 2000.0)
+    monkeypatch.setattr(line_times, "FIRST_LINE_S", 1000.0)
+    with line_times.lines_of_command():
+        assert 0 < line_times.until_line_s() <= 1000.0
+        line_times.note_line()
+        assert 1000.0 < line_times.until_line_s() <= 2000.0
 
 
 @pytest.mark.parametrize("is_command", [True, False])
