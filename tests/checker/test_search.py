@@ -2,19 +2,25 @@
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from flint import fmpq
 
 from cosim.analysis.certificates import Certificates
+from cosim.analysis.witnesses import resolved_content
 from noack.core.progress import no_progress
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from noack.theory.witnesses import semidefinite
-from noack.theory.witnesses.assumptions import first_assumptions
+from noack.theory.witnesses.assumptions import first_assumptions, without_drift
 from noack.theory.witnesses.coordinates import floats, simulated_frames
-from noack.theory.witnesses.documents import find_witness, rough_bounds
-from noack.theory.witnesses.effort import Effort, NoWitnessError, WorkLimitError
+from noack.theory.witnesses.documents import _by_forms, _Rates, _Wanted, find_witness, rough_bounds
+from noack.theory.witnesses.effort import Effort, NoWitnessError, TooLargeError, WorkLimitError
 from noack.theory.witnesses.line_search import search_lowest
+from noack.theory.witnesses.problem_size import problem_sizes, require_small
 from noack.theory.witnesses.search import Search
 from noack.theory.witnesses.semidefinite import Accuracy
 from noack.theory.witnesses.templates import Templates
@@ -22,9 +28,13 @@ from noack_check.balls import identity, matrix, number
 from noack_check.loop import Loop
 from noack_check.model import Model
 from noack_check.proof import read_assumptions
+from noack_check.scenario import read_loop
 from tests.checker.loops import SCHEDULE, bounds_of, double_integrator, pushed, scalar
 from tests.checker.proofs import proved
+from tests.checker.random_loops import random_loop
 from tests.helpers.shipped import resolved
+
+CASES = Path(__file__).parents[1] / "cases"
 
 
 @pytest.mark.parametrize("lowest", [0.15, 0.42, 0.6, 0.85])
@@ -182,6 +192,40 @@ def test_a_loop_that_does_not_decay_has_no_witness() -> None:
     loop = double_integrator()
     with pytest.raises(NoWitnessError, match="does not decay"):
         find_witness(loop._replace(gain=loop.gain * -1))
+
+
+def test_the_size_of_a_problem_is_known_before_its_inequalities() -> None:
+    rng = np.random.default_rng(0)
+    for kind in ("threshold", "periodic", "noisy"):
+        loop = random_loop(rng, kind)
+        rate = _Rates(loop).rate
+        document = without_drift(loop, first_assumptions(loop, rate))
+        if loop.times.period > 0:
+            document["pieces"] = 4
+        assumed = read_assumptions(loop, number(rate), document)
+        known = assumed.errors, assumed.noise
+
+        def model(decay: float, *of: Any, loop: Loop = loop, rate: float = rate, **more: Any) -> Model:
+            return Model(loop, number(rate), number(decay), *of, **more, is_exact=False)
+
+        templates = Templates(lambda decay: model(decay, *known, **assumed.of_model))  # noqa: B023
+        sizes = sorted(len(item.constant) for item in templates.at(1.0, "x", starts=False))
+        assert sizes == sorted(problem_sizes(templates.model))
+
+
+def test_a_loop_that_is_too_large_is_refused_at_once_with_what_is_small_enough() -> None:
+    """A speed loop whose updates act after 37 ms, three of them on their way, with a period of 10 ms."""
+    loop = read_loop(resolved_content(resolve(load(CASES / "drive_tie.toml"))), box=False, ideal=False)
+    effort = Effort(lambda share: pytest.fail("a problem was solved"))
+    with pytest.raises(TooLargeError) as refused:
+        _by_forms(loop, _Wanted(("x",), (), ()), effort)
+    assert str(refused.value) == (
+        "the loop's inequalities are too large for the search, by a factor of 1.5; small enough: updates "
+        "that act within 30 ms of their event, 37 ms now"
+    )
+    short = loop._replace(times=loop.times._replace(delay=fmpq(30, 1000)))
+    document = {**first_assumptions(short, 0.1), "pieces": 16}
+    require_small(short, number(0.1), document)
 
 
 def test_progress_rises_to_its_end() -> None:

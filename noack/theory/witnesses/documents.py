@@ -21,6 +21,7 @@ from noack.theory.witnesses.coordinates import floats, simulated_frames
 from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
 from noack.theory.witnesses.gains import find_by_gains, find_gains
 from noack.theory.witnesses.line_search import search_lowest
+from noack.theory.witnesses.problem_size import require_small
 from noack.theory.witnesses.search import FREE, Found, Search, refined
 from noack.theory.witnesses.semidefinite import Accuracy
 from noack.theory.witnesses.templates import Templates
@@ -258,6 +259,9 @@ def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort, tried: Sequence[int] 
         raise NoWitnessError("with losses quadratic forms are not known for a rule with a dynamic variable")
     fastest = min((each["rate"] for each in wanted.near if isinstance(each["rate"], float)), default=math.inf)
     last: tuple[_OutputSearch, str] | None = None
+    if not by_tests:  # a solver that fails with few pieces takes long, and more pieces may be needed
+        rate = _Rates(loop, slow=0.3).rate
+        require_small(loop, number(rate), {**first_assumptions(loop, rate), "pieces": _PIECES[-1]})
     pairs = [(pieces, 0) for pieces in tried or (_PIECES_OF_TESTS if by_tests else _PIECES)]
     shares: tuple[float, ...] = (0.3, 0.02)
     if loop.rule.memory is not None and loop.holds:  # one test bounds no K e_s, the time since the event does
@@ -369,6 +373,7 @@ class _OutputSearch:
         require_few(document)
         try:
             self._assumed = read_assumptions(loop, self._rate, document)
+            require_small(loop, self._rate, document)
             self._templates = Templates(self._model)
         except ValueError as error:
             raise NoWitnessError(str(error)) from None

@@ -1,5 +1,7 @@
 """The effort of a search: how far it is, and when it ends. It is counted in problems, not in seconds."""
 
+import math
+
 from noack.core.progress import Progress
 
 MOST_WORK = 20.0
@@ -18,11 +20,15 @@ class WorkLimitError(NoWitnessError):
     """The search has reached its limit of work."""
 
 
-def too_large(work: float) -> WorkLimitError:
-    """Return that a problem needs, or its first inequalities alone need, so many 10⁹ products per step."""
-    return WorkLimitError(
-        f"the loop's inequalities are too large for the search ({work:.3g} · 10⁹ products a step or more, "
-        f"at most {MOST_PER_PROBLEM:g} · 10⁹)"
+class TooLargeError(WorkLimitError):
+    """A problem is too large for the solver."""
+
+
+def too_large(work: float) -> TooLargeError:
+    """Return that a problem needs so many 10⁹ products per step, which are too many."""
+    share = math.ceil(10 * work / MOST_PER_PROBLEM) / 10
+    return TooLargeError(
+        f"the loop's inequalities are too large for the search, by a factor of {max(share, 1.1):g}"
     )
 
 
@@ -46,7 +52,8 @@ class Effort:
         """Count the next problem.
 
         Raises:
-            WorkLimitError: it is one too many, or too large.
+            WorkLimitError: it is one too many.
+            TooLargeError: it is too large.
         """
         if work > MOST_PER_PROBLEM:
             raise too_large(work)

@@ -8,10 +8,9 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix
 from noack.theory.witnesses.coordinates import floats
-from noack.theory.witnesses.effort import MOST_PER_PROBLEM, too_large
+from noack.theory.witnesses.problem_size import work_of
 from noack_check.model import Inequality, Model, Part
 
-_PER_ENTRY = 20_000
 _LOW, _HIGH = 1.0, 2.0
 
 
@@ -31,18 +30,11 @@ class Templates:
 
     Args:
         make: returns the model for a ν.
-
-    Raises:
-        WorkLimitError: there are too many.
     """
 
     def __init__(self, make: Callable[[float], Model]) -> None:
         self.model = make(_LOW)
-        self._low: list[Template] = []
-        for item in self.model.common_inequalities():
-            self._low.append(_template(item))
-            if (work := _work(self._low)) > MOST_PER_PROBLEM:
-                raise too_large(work)
+        self._low = [_template(item) for item in self.model.common_inequalities()]
         flows = takewhile(lambda item: item.name.startswith("flow/"), make(_HIGH).common_inequalities())
         self._high = [_template(item) for item in flows]
         self._outputs: dict[str, list[Template]] = {}
@@ -59,17 +51,7 @@ class Templates:
 
     def work(self, output: str) -> float:
         """Return about how many 10⁹ products the solver needs per step to bound an output."""
-        return _work(self.at(_LOW, output, starts=False))
-
-
-def _work(items: Iterable[Template]) -> float:
-    """Return about how many 10⁹ products the solver needs per step.
-
-    What it needs for each entry of an inequality counts as some thousand products.
-    """
-    sizes = [len(item.constant) for item in items]
-    entries = [q * (q + 1) / 2 for q in sizes]
-    return sum(count**3 + _PER_ENTRY * count for count in entries) / 1e9
+        return work_of(len(item.constant) for item in self.at(_LOW, output, starts=False))
 
 
 def _template(item: Inequality) -> Template:
