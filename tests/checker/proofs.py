@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from flint import arb, fmpq
 
-from cosim.analysis.witnesses import find_statement, resolved_content
+from cosim.analysis.witness_store import WitnessStore
+from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
 from noack.theory.certificates.proven_bounds import ProvenBounds
-from noack.theory.witnesses.documents import find_witness
+from noack.theory.witnesses.documents import Witness, find_witness
 from noack.theory.witnesses.outward import proven_bounds
 from noack_check.balls import matrix
 from noack_check.loop import Loop
@@ -65,6 +67,12 @@ class Proved:
     """Shared by all tests: copy it before changing it."""
     proof: Proof
 
+    @property
+    def statement(self) -> WitnessedStatement:
+        """The statement about a scenario, as a search returns it."""
+        plants, conditions = self.document["plants"], self.document["conditions"]
+        return WitnessedStatement(plants, conditions, self.document, self.proof, bounds=self.bounds)
+
     @functools.cached_property
     def bounds(self) -> ProvenBounds:
         """What is proven, as certificates have it."""
@@ -94,12 +102,15 @@ class OfScenario:
 
     name: str
     settings: Sequence[str]
-    plants: str
-    conditions: str
+    plants: str = "own"
+    conditions: str = "schedule"
+    longer: Mapping[str, fmpq] | None = None
+    """Some times are at least these, as those of a run that was late."""
 
     def search(self) -> Mapping[str, object]:
         """Return a document that is found anew."""
-        found = find_statement(resolved(self.name, *self.settings), self.plants, self.conditions)
+        scenario = resolved(self.name, *self.settings)
+        found = find_statement(scenario, self.plants, self.conditions, longer=self.longer)
         assert found.document is not None, found.reason
         return found.document
 
@@ -108,7 +119,9 @@ class OfScenario:
         content = resolved_content(resolved(self.name, *self.settings))
         enclosed = read_enclosed(content, document) if self.plants == "region" else None
         is_ideal = self.conditions == "ideal"
-        return read_loop(content, box=self.plants == "box", ideal=is_ideal, enclosed=enclosed)
+        return read_loop(
+            content, box=self.plants == "box", ideal=is_ideal, enclosed=enclosed, longer=self.longer
+        )
 
 
 def at_rate_0(floor: float) -> Loop:
@@ -128,6 +141,13 @@ RANDOM = (
     ("periodic", 14, ("e_c",)),
 )
 """Random loops with few states, of which proofs are short."""
+ANGLE = 'outputs=[{name="angle", row=[1.0, 0.0]}]'
+BELT = (
+    # A load that the voltage cannot cancel: dφ/dt = ω + d, so the shaft rests at 0 with ω = −d.
+    "model.load=[[1.0],[309.75]]", 'model.hold=["shaft_angle"]', "horizon_s=4",
+    'outputs=[{name="shaft_angle",row=[1,0],allowed=0.1},{name="speed",row=[0,1],allowed=2.0}]',
+)  # fmt: skip
+LATE = {"delay": 2 * of_scenario("double_integrator").times.delay}
 _MUTATED = ("x", "y[1]", "e_s", "e_c")
 
 SEARCHES: dict[str, OfLoop | OfScenario] = {
@@ -178,10 +198,16 @@ SEARCHES: dict[str, OfLoop | OfScenario] = {
         )
         for kind, seed, outputs in RANDOM
     },
+    "claims": OfScenario("double_integrator", ()),
+    "claims_late": OfScenario("double_integrator", (), longer=LATE),
+    "claims_box": OfScenario("double_integrator", (), "box"),
+    "claims_box_late": OfScenario("double_integrator", (), "box", longer=LATE),
+    "claims_belt": OfScenario("dc_motor_load", BELT),
     "filtered_mass": OfScenario("double_integrator", FILTERED_MASS, "own", "schedule"),
     "dc_motor_load": OfScenario("dc_motor_load", (), "own", "schedule"),
     "servo_reference": OfScenario("servo_reference", (), "box", "schedule"),
     "friction_servo": OfScenario("friction_servo", (), "region", "schedule"),
+    "sine_pendulum_angle": OfScenario("sine_pendulum", (ANGLE,), "region", "schedule"),
     "sine_pendulum": OfScenario("sine_pendulum", (), "region", "ideal"),
     "sine_pendulum_schedule": OfScenario("sine_pendulum", ("network.mansd=2",), "region", "schedule"),
 }
@@ -194,3 +220,16 @@ def proved(name: str) -> Proved:
     document = json.loads((FOLDER / f"{name}.json").read_text())
     loop = SEARCHES[name].loop_of(document)
     return Proved(loop, document, prove(loop, document))
+
+
+def use_stored(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """Let searches of loops that have the same numbers find these proofs; others are searched."""
+    stored = {WitnessStore(proved(name).loop).name: name for name in names}
+
+    def find(loop: Loop, outputs: Sequence[str], **options: Any) -> Witness:
+        name = stored.get(WitnessStore(loop).name)
+        if name is None:
+            return find_witness(loop, outputs, **options)
+        return Witness(proved(name).document, proved(name).proof)
+
+    monkeypatch.setattr("cosim.analysis.witnesses.find_witness", find)

@@ -139,3 +139,9 @@ KINDS: dict[str, Callable[[np.random.Generator], Loop]] = {
 def random_loop(rng: np.random.Generator, kind: str = "threshold") -> Loop:
     """Return a loop of a kind, with at most three states and three consecutive losses."""
     return KINDS[kind](rng)
+
+
+def long_run_s(loop: Loop) -> float:
+    """Return the time of 600 tests, or of 40 events of a periodic rule."""
+    times = loop.times
+    return float(arb(40 * times.period if times.period > 0 else 600 * times.sampling))

@@ -3,17 +3,18 @@
 from typing import Any
 
 import pytest
-from flint import arb
+from flint import arb, fmpq
 
 from cosim.analysis.witnesses import resolved_content
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack_check.__main__ import check_file
+from noack_check.balls import frobenius
 from noack_check.check import RejectedError
 from noack_check.document import read_number
 from noack_check.keys import RefusedError
-from noack_check.proof import Bound, conclude, prove, prove_bound, read_assumptions
+from noack_check.proof import Bound, conclude, error_without_input, prove, prove_bound, read_assumptions
 from noack_check.scenario import read_loop
 from noack_check.sentences import meaning
 from tests.checker.completed import completed
@@ -65,6 +66,14 @@ def test_a_loop_with_a_reference_is_read_about_its_rest_and_the_reference() -> N
     assert loop.push_before_input is not None  # the motor rests at 0.5 rad without a voltage
     assert floats(loop.push_before_input)[:, 0] == pytest.approx([0.0, 309.75 * 0.2, 0.0])
     assert loop.until is None  # it is a set-point
+
+
+def test_what_the_load_pushes_before_the_first_input_moves_the_sensors_error() -> None:
+    loop, time = read_loop(motor(), box=False, ideal=False), fmpq(1, 100)
+    assert loop.push_before_input is not None
+    at_rest = error_without_input(loop._replace(push_before_input=None), time)
+    moved = frobenius(loop.weight * loop.push_before_input) * arb(time)
+    assert 0.8 * moved < error_without_input(loop, time) - at_rest < 1.2 * moved
 
 
 def test_a_load_that_changes_is_refused() -> None:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from flint import arb
 
 from noack.theory.witnesses.documents import find_witness
 from noack.theory.witnesses.effort import NoWitnessError
@@ -10,25 +9,21 @@ from noack_check.balls import number
 from noack_check.loop import Loop
 from noack_check.proof import Proof
 from tests.checker.proofs import RANDOM, proved
-from tests.checker.random_loops import random_loop
+from tests.checker.random_loops import long_run_s, random_loop
 from tests.checker.runs import exceeded
 
 _RUNS = 6
-_TESTS, _PERIODS = 600, 40
-"""So long is a run."""
 
 
 def require_not_exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, runs: int) -> None:
-    times = loop.times
-    until = _PERIODS * times.period if times.period > 0 else _TESTS * times.sampling
     for _ in range(runs):
-        assert exceeded(loop, proof, rng, float(arb(until))) == []
+        assert exceeded(loop, proof, rng, long_run_s(loop)) == []
 
 
 @pytest.mark.parametrize(("kind", "seed"), [(kind, seed) for kind, seed, _ in RANDOM])
 def test_bounds_of_a_few_random_loops_are_not_exceeded(kind: str, seed: int) -> None:
     found = proved(f"random_{kind.replace(' ', '_')}_{seed}")
-    require_not_exceeded(found.loop, found.proof, np.random.default_rng(seed), 2)
+    require_not_exceeded(found.loop, found.proof, np.random.default_rng(seed), _RUNS)
 
 
 def test_runs_come_near_the_bounds() -> None:

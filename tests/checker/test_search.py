@@ -31,7 +31,8 @@ from noack_check.proof import read_assumptions
 from noack_check.scenario import read_loop
 from tests.checker.loops import SCHEDULE, bounds_of, double_integrator, pushed, scalar
 from tests.checker.proofs import proved
-from tests.checker.random_loops import random_loop
+from tests.checker.random_loops import long_run_s, random_loop
+from tests.checker.runs import exceeded
 from tests.helpers.shipped import resolved
 
 CASES = Path(__file__).parents[1] / "cases"
@@ -228,6 +229,16 @@ def test_a_loop_that_is_too_large_is_refused_at_once_with_what_is_small_enough()
     require_small(short, number(0.1), document)
 
 
+@pytest.mark.parametrize(("kind", "seed", "output"), [("threshold", 105, "e_c"), ("periodic", 11, "x")])
+def test_runs_stay_within_what_is_found_anew(kind: str, seed: int, output: str) -> None:
+    """A stored proof is true whatever the model leaves out; one that is found by such a model is not."""
+    rng = np.random.default_rng(seed)
+    loop = random_loop(rng, kind)
+    proof = find_witness(loop, (output,)).proof
+    for _ in range(4):
+        assert exceeded(loop, proof, rng, long_run_s(loop) / 2) == []
+
+
 def test_progress_rises_to_its_end() -> None:
     shares: list[float] = []
     find_witness(scalar(times=SCHEDULE), progress=shares.append)
@@ -262,6 +273,7 @@ def test_both_parts_of_a_bound_count_in_units_of_their_thresholds() -> None:
     assert by_forms.constant < 10 * 0.0005
     assert proof.inter_event is not None
     assert float(proof.inter_event) > 0.02
+    assert exceeded(loop, proof, np.random.default_rng(0), 6.0) == []
 
 
 def test_steps_are_improved_where_rounding_errors_end_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:

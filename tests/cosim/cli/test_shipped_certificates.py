@@ -13,7 +13,7 @@ from tests.helpers.command_line import invoke
 FILES = (Path(__file__).parents[3] / "scenarios").glob("*.toml")
 LIKE_OTHERS = {"lane_5g_arterial", "lane_5g_rural", "lane_weighted"}
 """Other numbers of scenarios that are tried."""
-USUAL = {"lane_following", "dc_motor_load", "friction_servo", "model_predictive"}
+USUAL = {"unstable_pendulum", "dc_motor_load", "friction_servo", "model_predictive"}
 """Scenarios that are tried by every ``make test``: a linear plant, a load, equations, no bounds."""
 SCENARIOS = [
     pytest.param(name, marks=() if name in USUAL else pytest.mark.deep)

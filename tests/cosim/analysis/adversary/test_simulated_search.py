@@ -2,22 +2,22 @@
 
 import pytest
 
-import noack
 from cosim.analysis.adversary import Objective, find_worst, find_worst_by_runs
-from cosim.analysis.certificates import certificates_of
-from cosim.analysis.scenario_certificates import quick_certificate
-from noack.scenario.resolution import resolve
+from cosim.analysis.scenario_certificates import certificate_of, quick_certificate
+from noack.theory.certificates.conditions import allowed_conditions
+from tests.checker.proofs import ANGLE, proved
+from tests.helpers.shipped import resolved
 
 ALL = tuple(Objective)
 
 
 def test_runs_of_a_linear_plant_have_the_values_of_the_linear_search() -> None:
-    resolved = resolve(noack.load("unstable_pendulum", {"horizon_s": 2.0}))
-    certificate = quick_certificate(resolved)
+    scenario = resolved("unstable_pendulum", "horizon_s=2.0")
+    certificate = quick_certificate(scenario)
     aims = (Objective.ERROR, Objective.STATE)
-    by_runs = find_worst_by_runs(resolved, aims, certificate, most_runs=40).objectives
+    by_runs = find_worst_by_runs(scenario, aims, certificate, most_runs=40).objectives
     for aim, found in zip(aims, by_runs, strict=True):
-        searched = find_worst(resolved, aim, most_nodes=2_000, beam=16, certificate=certificate)
+        searched = find_worst(scenario, aim, most_nodes=2_000, beam=16, certificate=certificate)
         # Errors are those at measurements, where the record has them, there at steps of the plant.
         near = {"rel": 0.02 if aim is Objective.ERROR else 1e-9}
         assert found.lossless == pytest.approx(searched.lossless, **near)
@@ -29,32 +29,20 @@ def test_runs_of_a_linear_plant_have_the_values_of_the_linear_search() -> None:
         assert found.tightness <= 1
 
 
-@pytest.fixture(scope="module")
-def pendulum() -> noack.Scenario:
-    outputs = [{"name": "angle", "row": [1.0, 0.0]}]
-    return noack.load("sine_pendulum", {"horizon_s": 1.5, "outputs": outputs})
-
-
-def test_a_plant_of_equations_is_searched_by_runs_within_its_guarantee(pendulum: noack.Scenario) -> None:
-    resolved = resolve(pendulum)
-    certificate = quick_certificate(resolved)
-    found, shares = find_worst_by_runs(resolved, ALL, certificate, most_runs=12)
+def test_a_plant_of_equations_is_searched_by_runs_within_its_guarantee() -> None:
+    scenario = resolved("sine_pendulum", "horizon_s=1.5", ANGLE)
+    certificate = certificate_of(
+        scenario, proved("sine_pendulum_angle").statement, allowed_conditions(scenario)
+    )
+    assert certificate.proven is not None
+    found, shares = find_worst_by_runs(scenario, ALL, certificate, most_runs=24)
     assert [worst.objective for worst in found] == list(ALL)
     for worst in found:
         assert worst.pattern[0]
-        assert "L" * (resolved.network.mansd + 1) not in worst.text
+        assert "L" * (scenario.network.mansd + 1) not in worst.text
         assert not worst.breaches
-        assert worst.runs <= 12 + 2 * len(ALL)
-    assert (found, shares) == find_worst_by_runs(resolved, ALL, certificate, most_runs=12)
-
-
-@pytest.mark.deep
-def test_the_worst_runs_of_a_plant_of_equations_reach_a_third_of_its_bounds(pendulum: noack.Scenario) -> None:
-    results, resolved = certificates_of(pendulum), resolve(pendulum)
-    results.prove(conditions=("schedule",))
-    certificate = results.schedule
-    assert certificate.proven is not None
-    found, shares = find_worst_by_runs(resolved, ALL, certificate, most_runs=24)
+        assert worst.runs <= 24 + 2 * len(ALL)
+    assert (found, shares) == find_worst_by_runs(scenario, ALL, certificate, most_runs=24)
     assert shares.keys() == {"angle"}
     assert 1 / 3 < shares["angle"] <= 1
     (state,) = (worst for worst in found if worst.objective is Objective.STATE)

@@ -15,9 +15,16 @@ from noack.core.number_format import at_most
 from noack.protocol.record_tables import PLANT_STEP
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
+from tests.checker.proofs import BELT, use_stored
 from tests.helpers.shipped import resolved
 
 PROVEN = ProvenBounds(0.2, {"x": ProvenBound(7.0, 0.5)}, {}, 0.25, 0.125, is_quiet=True)
+
+
+@pytest.fixture(autouse=True)
+def proofs_are_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the scenario's plant and of its box, also with a late network; of a motor with a load."""
+    use_stored(monkeypatch, "claims", "claims_box", "claims_late", "claims_box_late", "claims_belt")
 
 
 @pytest.fixture(scope="module")
@@ -114,13 +121,6 @@ def test_outputs_are_claimed_with_their_bounds_and_allowed_errors() -> None:
     late = run["plant_step"]["t_ns"] * 1e-9 >= settles_s
     assert stays.observed == pytest.approx(np.abs(run["plant_step"]["x"][late, 0]).max())
     assert (stays.output, stays.origin) == ("position", "certificate (proved)")
-
-
-BELT = (
-    # A load that the voltage cannot cancel: dφ/dt = ω + d, so the shaft rests at 0 with ω = −d.
-    "model.load=[[1.0],[309.75]]", 'model.hold=["shaft_angle"]', "horizon_s=4",
-    'outputs=[{name="shaft_angle",row=[1,0],allowed=0.1},{name="speed",row=[0,1],allowed=2.0}]',
-)  # fmt: skip
 
 
 def test_bounds_of_a_loop_with_a_load_are_checked_about_its_rest() -> None:
