@@ -144,7 +144,7 @@ def _strays_at_ends(steps: Int64s, t_ns: Int64s, period_ns: float) -> NDArray[np
     """
     strays = np.zeros(len(steps) + 1, bool)
     ahead = steps.astype(float) - np.diff(t_ns) / period_ns
-    far = (np.abs(ahead) > _FAR_AHEAD_NS / period_ns) & (np.abs(steps) > _FAR_BACK)
+    far = (np.maximum(ahead, -steps) > _FAR_AHEAD_NS / period_ns) & (np.abs(steps) > _FAR_BACK)
     jumps = np.flatnonzero(far)
     before = jumps[jumps < _FEWEST_AFTER_RESTART - 1]
     behind = jumps[jumps > len(steps) - _FEWEST_AFTER_RESTART]
