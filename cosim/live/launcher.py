@@ -56,6 +56,8 @@ _STOPPED_S = 15.0
 DEFAULT_START_S = 30.0
 """Wall time within which all processes have to be ready, if the scenario gives none."""
 _POLL_S, _STARTING_POLL_S = 0.01, 0.002
+_LONGEST_WAIT_S = 1.0
+"""What a turn of the launcher counts at most in its limits."""
 _EARLY_CERTIFICATES_S = 5.0
 """Wall time of a run during which a process computes its certificates; in less, it hardly starts."""
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
@@ -257,7 +259,8 @@ class _Run:
         time.sleep(_POLL_S if self._has_started else _STARTING_POLL_S)
         last_s, self._last_s = self._last_s, time.monotonic()
         if waits:
-            self._limit.wait(self._last_s - last_s, os.getloadavg()[0])
+            # Not the time during which this process was stopped.
+            self._limit.wait(min(self._last_s - last_s, _LONGEST_WAIT_S), os.getloadavg()[0])
         if self._last_s >= self._next_look_s:
             self._next_look_s = self._last_s + 1.0
             since_s = self._stopped_since_s
@@ -289,8 +292,9 @@ class _Run:
         failures = {
             role: EndReason(ExitStatus.FAILED, why)
             for role, why in self._coordinator.failures().items()
-            # The exit status of a launched process explains more than its report.
+            # The exit status of a launched process explains more than its report, or its lost connection.
             if not (role in running and self._coordinator.is_exiting(role))
+            and not (role in self._children and role not in running and not self._coordinator.has_ended(role))
         }
         if RECORDER in running and self._coordinator.now_ns() >= self._horizon_ns:
             failures.pop(RECORDER, None)  # sorting a long record, it may not respond

@@ -7,7 +7,7 @@ rows of a process.
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,14 +59,18 @@ def add_kept_reports(run_dir: Path) -> None:
     content = read_object(run_dir / REPORTS_FILE)
     reports = [content[role] for role in LOOP_ROLES if isinstance(content.get(role), dict)]
     reported = {report.get("process") for report in reports}
-    new_reports = []
+    new_reports = [report for report in kept_reports(run_dir) if report["process"] not in reported]
+    if new_reports:
+        write_reports(run_dir, [*reports, *new_reports])
+
+
+def kept_reports(run_dir: Path) -> Iterator[Report]:
+    """Yield the reports that processes of the loop wrote to the spool, as they could not send them."""
     for _, text in read_batches(run_dir / SPOOL, KEPT_REPORT):
         with contextlib.suppress(PeerError):  # damaged
             report = parse_message(ProcessReport, text).fields()
-            if report.get("process") in LOOP_ROLES and report["process"] not in reported:
-                new_reports.append(report)
-    if new_reports:
-        write_reports(run_dir, [*reports, *new_reports])
+            if report.get("process") in LOOP_ROLES:
+                yield report
 
 
 Entries = Mapping[str, Any]

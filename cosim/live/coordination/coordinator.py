@@ -9,11 +9,13 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
 from cosim.live.coordination.change_requests import ChangeRequests
+from cosim.record.processes import kept_reports
 from noack.core.clock import RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.core.system_processes import cores
@@ -36,6 +38,10 @@ from noack.scenario.resolution import ResolvedRun
 
 _REPORT_GRACE_S = 0.3
 """A process's last message may arrive this much later than its exit is seen."""
+_LOOK_S = 0.5
+"""Time between two looks for reports on disk."""
+_OWN_STOP_S = 1.0
+"""A longer time between two polls is a stop of this process, during which no other could be found lost."""
 _EXIT_GRACE_S = 5.0
 """By then a process has exited that has reported its end."""
 _START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
@@ -61,13 +67,14 @@ class _Member:
     ended: str | None = None
     """Why it ended, by its own report."""
     ended_s: float = 0.0
+    is_lost: bool = False
+    """Whether its connection broke, and neither came back nor was followed by a report."""
 
-    @property
-    def is_lost(self) -> bool:
-        """Whether its connection broke, and neither came back nor was followed by a report."""
+    def is_missing(self, for_s: float = 0.0) -> bool:
+        """Whether its connection has been broken for some time, without a report of its end."""
         if self.ended is not None or self.vanished_s is None:
             return False
-        return time.monotonic() - self.vanished_s > self.lost_after_s
+        return time.monotonic() - self.vanished_s > for_s
 
     def failure(self) -> str | None:
         """Why it is over before its work was done; None if it is not over, or did its work."""
@@ -120,6 +127,8 @@ class Coordinator:
         self._reported: dict[str, str] = {}
         """Why processes ended, by role."""
         self._stopped: str | None = None
+        self._run_dir = Path(access.run_dir)
+        self._polled_s = self._next_look_s = time.monotonic()
 
     @property
     def epoch_ns(self) -> int | None:
@@ -141,6 +150,7 @@ class Coordinator:
                 self._note_end(end)
         while (token := self._tokens.try_recv()) is not None:
             self._note_connection(token)
+        self._note_lost()
         while (query := self._admissions.try_recv()) is not None:
             self._answer(query, self._admit)
         while (query := self._joins.try_recv()) is not None:
@@ -252,7 +262,8 @@ class Coordinator:
             raise PeerError("a process of the loop needs an address, the recorder has none")
         if self._clock is not None and request.address != member.address:
             raise PeerError("its address must not change during the run")
-        member.address, member.query, member.vanished_s = request.address, query, None
+        member.address, member.query = request.address, query
+        member.vanished_s, member.is_lost = None, False
         self._members[role] = member
         if self._clock is not None:
             self._let_pass(member, self._clock.epoch_ns)
@@ -302,17 +313,39 @@ class Coordinator:
         member = self._admitted.get(_sender(token.key_expr))
         if member is None:
             return
-        member.vanished_s = None
+        member.vanished_s, member.is_lost = None, False
         if token.kind == zenoh.SampleKind.DELETE:
             member.vanished_s = time.monotonic()
             self._leave_barrier(member)
 
+    def _note_lost(self) -> None:
+        """Note which processes are lost.
+
+        A process whose connection broke may have reached the end, and have written its report to disk.
+        While this process was stopped, no connection could come back.
+        """
+        last_s, self._polled_s = self._polled_s, time.monotonic()
+        missing = [member for member in self._admitted.values() if member.is_missing()]
+        if self._polled_s - last_s > _OWN_STOP_S:
+            for member in missing:
+                assert member.vanished_s is not None
+                member.vanished_s += self._polled_s - last_s
+        if missing and self._polled_s >= self._next_look_s:
+            self._next_look_s = self._polled_s + _LOOK_S
+            for report in kept_reports(self._run_dir):
+                self._end(report["process"], report.get("instance", ""), report["ended"])
+        for member in self._admitted.values():
+            member.is_lost = member.is_missing(member.lost_after_s)
+
     def _note_end(self, end: zenoh.Sample) -> None:
         """Note why a process ended, by its own report."""
         reason = end.payload.to_bytes().decode(errors="replace")
-        role, _ = sender = _sender(end.key_expr)
+        role, instance = _sender(end.key_expr)
         self._reported[role] = reason
-        if (member := self._admitted.get(sender)) is not None and member.ended is None:
+        self._end(role, instance, reason)
+
+    def _end(self, role: str, instance: str, reason: str) -> None:
+        if (member := self._admitted.get((role, instance))) is not None and member.ended is None:
             member.ended, member.ended_s = reason, time.monotonic()
             self._leave_barrier(member)
 

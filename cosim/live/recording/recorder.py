@@ -19,7 +19,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from cosim.live.recording.telemetry_store import TelemetryStore
 from cosim.record.decimation import is_long
-from cosim.record.processes import report_of, write_reports
+from cosim.record.processes import kept_reports, report_of, write_reports
 from cosim.record.rows import Rows, messages_in
 from cosim.record.run_directory import RECORDING_FILE, active_run
 from noack.core.clock import NS_PER_S
@@ -80,6 +80,8 @@ class ProcessTokens:
         )
         self._vanished_s: dict[str, dict[str, float]] = {role: {} for role in LOOP_ROLES}
         """When the token of each instance vanished, by role; infinity while it exists."""
+        self._stored: set[str] = set()
+        """Roles whose process has written its report to the spool."""
 
     def update(self) -> None:
         """Take the changes that have arrived."""
@@ -88,6 +90,13 @@ class ProcessTokens:
             vanished = token.kind == zenoh.SampleKind.DELETE
             if role in self._vanished_s:
                 self._vanished_s[role][instance] = time.monotonic() if vanished else math.inf
+
+    def note_stored(self, run_dir: Path) -> None:
+        """Note which processes are gone that have written their last rows and their report to the spool."""
+        for report in kept_reports(run_dir):
+            vanished_s = self._vanished_s[report["process"]].get(report.get("instance", ""), math.inf)
+            if vanished_s < math.inf:
+                self._stored.add(report["process"])
 
     def all_done(self, reported: Container[str], *, stopping: bool) -> bool:
         """Whether each process has reported its end, or is gone.
@@ -102,7 +111,7 @@ class ProcessTokens:
         disconnect_timeout_s = 0.0 if stopping else LAUNCHED_LOST_S
 
         def is_done(role: str) -> bool:
-            if role in reported:
+            if role in reported or role in self._stored:
                 return True
             vanished_s = self._vanished_s[role].values()
             return bool(vanished_s) and now_s - max(*vanished_s, self._connected_s) > disconnect_timeout_s
@@ -176,6 +185,11 @@ class Recorder:
     def finished(self) -> bool:
         """Whether every process of the loop has handed over its rows, or is gone."""
         return self._tokens.all_done(self._reports.keys(), stopping=self.is_stopping)
+
+    def note_stored(self) -> None:
+        """Note which processes have written their reports to the spool instead of sending them."""
+        if self.without_report:
+            self._tokens.note_stored(self._run_dir)
 
     @property
     def without_report(self) -> list[str]:
@@ -404,6 +418,7 @@ def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
             shown_s = now_s
         if now_s - acknowledged_s >= _ACKNOWLEDGE_S:
             recorder.acknowledge()
+            recorder.note_stored()
             acknowledged_s = now_s
         if process.stopping:
             if process.ended == LAUNCHER_GONE:

@@ -129,6 +129,15 @@ def test_a_process_that_fails_ends_the_run_with_its_reason(
     assert case.run(case.children(code), coordinator)._failure() == expected
 
 
+@pytest.mark.parametrize(("code", "fails"), [(None, True), (0, False), (-9, True)])
+def test_a_launched_process_that_has_exited_well_is_not_lost(
+    case: Case, code: int | None, fails: bool
+) -> None:
+    """Its connection was lost, as the launcher was stopped."""
+    coordinator = FakeCoordinator(2.0, sensor="stopped responding")
+    assert (case.run(case.children(code), coordinator)._failure() is not None) is fails
+
+
 @pytest.mark.parametrize(
     ("running", "lost", "late"),
     [

@@ -1,6 +1,8 @@
 """The coordinator: admission, lost connections."""
 
 import json
+import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,6 +13,7 @@ from cosim.live.coordination.coordinator import Coordinator
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
 from noack.runtime.control_messages import ClockError
 from noack.runtime.host_clocks import CHRONY
+from noack.runtime.telemetry import OwnSpool
 from noack.scenario.resolution import ResolvedRun
 from noack.scenario.run_sections import ClocksSection
 from tests.fuzz.plane import FakePlane, Query, Sample
@@ -23,10 +26,11 @@ def plane() -> FakePlane:
 
 
 @pytest.fixture
-def barrier(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> Coordinator:
+def barrier(plane: FakePlane, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Coordinator:
     monkeypatch.setattr(coordinator, "ControlPlane", lambda *_, **__: plane)
     monkeypatch.setattr(coordinator, "_REPORT_GRACE_S", -1.0)  # do not wait for reports
-    return Coordinator(RUN_DESCRIPTOR, ResolvedRun(RUN_DESCRIPTOR.scenario))
+    access = RUN_DESCRIPTOR.model_copy(update={"run_dir": str(tmp_path)})
+    return Coordinator(access, ResolvedRun(RUN_DESCRIPTOR.scenario))
 
 
 def ask(
@@ -171,3 +175,48 @@ def test_a_host_whose_clock_may_be_off_by_too_much_is_refused(
             ask(plane, barrier, "admit", role=role)
         ask(plane, barrier, "join", role=role)
     assert plane.answers[-1].clocks == {role: other if role == "sensor" else own for role in LOOP_ROLES}
+
+
+def start(plane: FakePlane, barrier: Coordinator) -> None:
+    for role in ROLES:
+        ask(plane, barrier, "admit", role=role)
+        ask(plane, barrier, "join", role=role)
+    assert barrier.epoch_ns is not None
+
+
+@pytest.mark.parametrize(("ended", "failures"), [
+    ("horizon", {}), ("the disk is full", {"sensor": "sensor ended early: the disk is full"}),
+])  # fmt: skip
+def test_a_process_that_could_not_report_its_end_is_not_lost(
+    plane: FakePlane, barrier: Coordinator, tmp_path: Path, ended: str, failures: dict[str, str]
+) -> None:
+    """It could not, as this process was stopped at the horizon: its report is on disk."""
+    start(plane, barrier)
+    report = {"ended": ended, "channel": {}, "rows": {}}
+    spool = OwnSpool(tmp_path, "sensor", "secret")
+    spool.keep_report(report | {"instance": "another"})
+    lose(plane, barrier)
+    assert not barrier.has_ended("sensor")
+    spool.keep_report(report | {"instance": "one"})
+    spool.files.close()
+    barrier._members["sensor"].lost_after_s = -1.0
+    barrier._next_look_s = -math.inf
+    barrier.poll()
+    assert barrier.has_ended("sensor")
+    assert barrier.is_over("sensor")
+    assert barrier.failures() == failures
+
+
+def test_while_the_coordinator_was_stopped_no_process_is_lost(plane: FakePlane, barrier: Coordinator) -> None:
+    """No connection could come back."""
+    start(plane, barrier)
+    lose(plane, barrier)
+    member, stopped_s = barrier._members["sensor"], 20.0
+    assert member.vanished_s is not None
+    member.vanished_s -= stopped_s
+    barrier._polled_s -= stopped_s
+    barrier.poll()
+    assert barrier.failures() == {}
+    member.vanished_s -= stopped_s
+    barrier.poll()
+    assert barrier.failures() == {"sensor": "sensor stopped responding"}

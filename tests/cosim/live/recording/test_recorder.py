@@ -23,6 +23,7 @@ from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import RunProgress, parse_message
 from noack.runtime.spool import NOTICES, SPOOL, read_batches
+from noack.runtime.telemetry import OwnSpool
 from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, validate
@@ -121,6 +122,23 @@ def test_a_process_that_left_the_start_barrier_is_gone_once_the_one_in_its_place
     run.recorder.poll()
     assert not run.recorder.finished
     assert run.report("plant", instance="plant2") == {}
+    assert run.recorder.finished
+
+
+def test_a_process_that_wrote_its_report_to_the_spool_is_done_once_it_is_gone(run: Run) -> None:
+    for role in set(LOOP_ROLES) - {"plant"}:
+        assert run.report(role) == {}
+    kept = {"ended": "horizon", "channel": {}, "rows": {}, "instance": "plant"}
+    spool = OwnSpool(run.run_dir, "plant", "secret")
+    spool.keep_report(kept)
+    spool.files.close()
+    run.recorder.note_stored()
+    assert not run.recorder.finished  # it may be one of an earlier process
+    vanished = Sample("noack/0/alive/plant/plant")
+    vanished.kind = zenoh.SampleKind.DELETE  # type: ignore[assignment]
+    run.plane.put("alive", vanished)
+    run.recorder.poll()
+    run.recorder.note_stored()
     assert run.recorder.finished
 
 
