@@ -97,8 +97,9 @@ def find_scenario(name: str) -> Path:
 
 def load_scenario(name: str, settings: Sequence[str] | None, network: Path | None = None) -> "Scenario":
     """Load a scenario given by path or name, with the network of a file and the values of ``--set``."""
-    from noack.scenario.scenario_file import load
+    from noack.scenario.scenario_file import load, require_keys_once
 
+    require_keys_once(settings or ())
     return load(find_scenario(name), settings or (), network=network)
 
 

@@ -331,13 +331,16 @@ def settings_of(overrides: Iterable[str], example: str = "trigger.beta=0.3") -> 
     """Return keys and values of ``--set KEY=VALUE``; the value None, of ``KEY=none``, removes a key.
 
     Raises:
-        CallerError: a setting is written otherwise, or a key is given twice.
+        CallerError: a setting is written otherwise.
     """
-    settings = [_setting_of(override, example) for override in overrides]
-    keys = [full_key(key) for key, _ in settings]
+    return [_setting_of(override, example) for override in overrides]
+
+
+def require_keys_once(overrides: Sequence[str]) -> None:
+    """Raise CallerError if a command line sets a key twice."""
+    keys = [full_key(override.partition("=")[0].strip()) for override in overrides]
     if repeated := [key for key in keys if keys.count(key) > 1]:
         raise CallerError(f"--set {shortened(printable(repeated[0]))}: is given twice")
-    return settings
 
 
 def _setting_of(override: str, example: str) -> tuple[str, object]:

@@ -185,8 +185,9 @@ def new(
 
 def _table(assignments: Sequence[str] | None) -> dict[str, object]:
     """Return the values of --set by their keys."""
-    from noack.scenario.scenario_file import settings_of
+    from noack.scenario.scenario_file import require_keys_once, settings_of
 
+    require_keys_once(assignments or ())
     return dict(settings_of(assignments or (), "plant.system.cart_kg=1.0"))
 
 

@@ -158,6 +158,16 @@ class Metrics(ScenarioSection):
     """A run has settled when ‖x − x_r‖ stays below this share of its first value; x_r is 0 by default."""
     most_events: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
     """A run with more transmissions is stopped."""
+    output: str | None = None
+    """The output or state of the metric output_largest; needs time = "sampled"."""
+    from_s: Annotated[FiniteFloat, Field(ge=0)] = 0.0
+    """From when on output_largest counts, in s."""
+
+    def heading(self, metric: Metric) -> str:
+        """Return the heading of a column."""
+        if metric == "output_largest":
+            return f"largest |{self.output}| from {self.from_s:g} s on"
+        return METRICS[metric].heading
 
 
 class PairedComparison(ScenarioSection):
@@ -174,6 +184,12 @@ class _Figure(ScenarioSection):
     """The keys that name the axes which the figure shows as coordinates or series."""
     where: dict[str, Value] = Field({})
     """Only grid points with these values of these axes."""
+
+    @property
+    def axes_metrics(self) -> list[tuple[str, Metric]]:
+        """The keys that name metrics, and these."""
+        keys = ("x", "y") if isinstance(self, Pareto) else ("metric",)
+        return [(key, getattr(self, key)) for key in keys]
 
 
 class Pareto(_Figure):
@@ -283,6 +299,10 @@ class Campaign(ScenarioSection):
                         "and two axes cannot set the same key"
                     )
         _require_kept("settings", self.settings)
+        if self.metrics.output is None and "output_largest" in self._used_metrics():
+            raise ValueError("metrics.output: missing; output_largest needs the name of an output or state")
+        if self.metrics.output is not None and self.time != "sampled":
+            raise ValueError('metrics.output: needs time = "sampled"')
         size = math.prod(len(axis.labels) for axis in self.axes)
         if size > MOST_POINTS:
             raise ValueError(f"axes: the grid has {size} points; at most {MOST_POINTS} are allowed")
@@ -292,6 +312,12 @@ class Campaign(ScenarioSection):
         for i, figure in enumerate(self.figures):
             self._check_figure(f"figures.{i}", figure)
         return self
+
+    def _used_metrics(self) -> set[Metric]:
+        return {
+            *self.metrics.shown,
+            *(metric for figure in self.figures for _, metric in figure.axes_metrics),
+        }
 
     def _check_figure(self, path: str, figure: AnyFigure) -> None:
         axis_names = [getattr(figure, key) for key in figure.spanned]

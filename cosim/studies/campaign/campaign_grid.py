@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from cosim.shipped_files import find_shipped
 from cosim.simulation.exact_simulation import ROW, Setting, left_out, run_batch, setting_of
-from cosim.studies.campaign.campaign_file import Campaign, Value
+from cosim.studies.campaign.campaign_file import Campaign, Metrics, Value
 from cosim.studies.campaign.campaign_workers import Work
-from cosim.studies.campaign.drawn_runs import LOOPS_ROW, SampledWork, SharedNetworkWork, in_virtual_time
-from cosim.studies.campaign.metrics import certified_error
+from cosim.studies.campaign.drawn_runs import SampledWork, SharedNetworkWork, in_virtual_time, measured_rows
+from cosim.studies.campaign.metrics import METRICS, OF_THRESHOLD, certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario import toml_file
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import ResolvedRun, policy_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put
 from noack.settings.section import MatrixRows, Table, require_shape
@@ -46,6 +46,8 @@ class Point:
     """Certified bound Δβ, or None."""
     work: Work
     """Computes the draws of the point."""
+    error_scale: object = None
+    """What ``sup_e_c_scaled`` is in units of: rate and norm of each loop's threshold."""
 
 
 @dataclass(frozen=True)
@@ -103,16 +105,43 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
             work, certified = _work(campaign, scenario)
         except (CallerError, ValueError) as error:
             raise CallerError(f"{source}: {error}") from None
-        points.append(Point(number, indices, labels, values, scenario, certified, work))
+        scale = _error_scale(scenario)
+        points.append(Point(number, indices, labels, values, scenario, certified, work, scale))
     if len({type(point.work) for point in points}) > 1:
         raise CallerError(f"{path}: axes: either all grid points have loops, or none has")
     _require_effects(campaign, points, path)
+    _require_comparable(campaign, points, path)
     return points
 
 
 def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
     """Return the type of the rows of runs."""
-    return LOOPS_ROW if isinstance(points[0].work, SharedNetworkWork) else ROW
+    work = points[0].work
+    return work.row_type if isinstance(work, SampledWork) else ROW
+
+
+def _error_scale(scenario: Scenario) -> tuple[tuple[float, object], ...]:
+    """Return rate and norm of the threshold of each loop, which ``sup_e_c_scaled`` depends on."""
+    policies = [policy_of(resolve(entry.scenario)) for entry in ResolvedRun(scenario).entries]
+    return tuple((policy.fading_per_s, getattr(policy, "weight", None)) for policy in policies)
+
+
+def _require_comparable(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
+    """Refuse a figure of ``sup_e_c_scaled`` at points whose thresholds decay otherwise or have other norms.
+
+    Raises:
+        CallerError: a figure compares what is not comparable.
+    """
+    for i, figure in enumerate(campaign.figures):
+        for key, metric in figure.axes_metrics:
+            shown = {*campaign.selected(figure.where)}
+            scales = {repr(point.error_scale) for point in points if point.indices in shown}
+            if metric == OF_THRESHOLD and len(scales) > 1:
+                raise CallerError(
+                    f"{path}: figures.{i}.{key} = {metric}: is not comparable: it is "
+                    f"{METRICS[metric].title}, and α or the trigger's norm differs between the points; "
+                    "choose points with where, or another metric"
+                )
 
 
 def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
@@ -149,13 +178,16 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
     R = _weight(metrics.R, "metrics.R", m, "one row per input")
     measured: _Measured = {"Q": Q, "R": R, "settle": metrics.settle, "most_events": metrics.most_events}
-    if scenario.loops:
-        if campaign.time != "sampled":
-            raise CallerError('loops: a network that loops share needs time = "sampled"')
-        return SharedNetworkWork(in_virtual_time(scenario), campaign.seed, **measured), None
-    resolved = resolve(scenario)
+    if scenario.loops and campaign.time != "sampled":
+        raise CallerError('loops: a network that loops share needs time = "sampled"')
     if campaign.time == "sampled":
-        return SampledWork(in_virtual_time(scenario), campaign.seed, **measured), None
+        _require_output(metrics, scenario)
+        kind = SharedNetworkWork if scenario.loops else SampledWork
+        work = kind(
+            in_virtual_time(scenario), campaign.seed, **measured, output=metrics.output, from_s=metrics.from_s
+        )
+        return work, None
+    resolved = resolve(scenario)
     if resolved.protocol.acknowledges:
         raise CallerError(
             'network.protocol: continuous time needs the loop without acknowledgements, "none"; '
@@ -172,6 +204,20 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     except CallerError as error:
         raise CallerError(f'{error}; time = "sampled" runs it as `noack simulate` does') from None
     return ContinuousWork(setting, box_of(scenario), campaign.seed), certified_error(resolved)
+
+
+def _require_output(metrics: Metrics, scenario: Scenario) -> None:
+    """Raise CallerError unless each loop has the output that is measured, before the horizon."""
+    if metrics.output is None:
+        return
+    for entry in ResolvedRun(scenario).entries:
+        names = measured_rows(entry.scenario)
+        if metrics.output not in names:
+            raise CallerError(
+                f"metrics.output = {metrics.output}: no such output; it is one of {', '.join(names)}"
+            )
+    if metrics.from_s >= scenario.horizon_s:
+        raise CallerError(f"metrics.from_s = {metrics.from_s:g}: the runs end at {scenario.horizon_s:g} s")
 
 
 def _weight(rows: MatrixRows | None, key: str, size: int, reason: str) -> Matrix | None:

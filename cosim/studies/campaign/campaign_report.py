@@ -20,7 +20,7 @@ from cosim.studies.campaign.campaign_grid import base_of, grid
 from cosim.studies.campaign.campaign_summary import CampaignSummary, summarise
 from cosim.studies.campaign.campaign_workers import Runner
 from cosim.studies.campaign.chunk_store import RUNS, Store, locked_folder, run_campaign
-from cosim.studies.campaign.metrics import METRICS, Estimate, Metric, to_shown_unit
+from cosim.studies.campaign.metrics import Estimate, Metric, to_shown_unit
 from noack.core.file_access import write_whole
 from noack.core.number_checks import whole_number
 from noack.core.number_format import plus_minus
@@ -81,7 +81,7 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
     campaign, metric_names = summary.campaign, summary.campaign.metrics.shown
     headings = [
         *(axis.name_in_figures for axis in campaign.axes),
-        *(METRICS[name].heading for name in metric_names),
+        *(campaign.metrics.heading(name) for name in metric_names),
     ]
     means = [
         (

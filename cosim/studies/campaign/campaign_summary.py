@@ -12,6 +12,7 @@ from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.metrics import (
     CONFIDENCE,
+    OF_THRESHOLD,
     BurstFrequency,
     Estimate,
     Metric,
@@ -140,5 +141,6 @@ def _comparisons(campaign: Campaign, store: Store) -> Iterator[ComparedResult]:
                     name: difference(values, reference_runs[name])
                     for name, values in runs_at(point, store)[0].items()
                     if name in reference_runs
+                    and (name != OF_THRESHOLD or point.error_scale == reference.error_scale)
                 }
                 yield ComparedResult(point, reference, differences)

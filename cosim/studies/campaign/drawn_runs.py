@@ -61,6 +61,8 @@ class SampledWork:
         R: weight of the input, (m, m); None: the identity.
         settle: a run has settled when ‖x − x_r‖ stays at or below this share of its first value.
         most_events: a run with more events is stopped.
+        output: the output or state whose largest distance from the reference is measured, or None.
+        from_s: from when on.
     """
 
     scenario: Scenario
@@ -69,10 +71,17 @@ class SampledWork:
     R: Matrix | None
     settle: float
     most_events: int
+    output: str | None = None
+    from_s: float = 0.0
+
+    @property
+    def row_type(self) -> np.dtype[np.void]:
+        """The type of the rows of runs."""
+        return ROW if self.output is None else _with_output(ROW)
 
     def run(self, draws: range) -> NDArray[np.void]:
-        """Compute consecutive draws; one row of ``exact_simulation.ROW`` each."""
-        rows = np.zeros(len(draws), ROW)
+        """Compute consecutive draws; one row of ``row_type`` each."""
+        rows = np.zeros(len(draws), self.row_type)
         for row, draw in zip(rows, draws, strict=True):
             record = simulate(drawn_scenario(self.scenario, self.seed, draw))
             with np.errstate(all="ignore"):  # the status reports a run that diverges
@@ -88,7 +97,7 @@ class SampledWork:
         row["transmissions"] = len(events_s)
         row["deliveries"] = len(record[CONTROLLER_DELIVERY])
         row["longest_loss_burst"] = packet_outcomes(record).longest_loss_burst()
-        for name in _UNKNOWN:
+        for name in (*_UNKNOWN, *(() if self.output is None else (OUTPUT_LARGEST,))):
             row[name] = np.nan
         if len(gaps_s):
             row["inter_event_min_s"], row["inter_event_mean_s"] = gaps_s.min(), gaps_s.mean()
@@ -103,13 +112,17 @@ class SampledWork:
             return
         row["status"] = OK
         # Settling, about the reference.
-        deviations, reference = norms, reference_in_run(record)
+        x, reference = steps["x"], reference_in_run(record)
         if reference is not None:
-            deviations = np.linalg.norm(steps["x"] - reference.states(steps["t_ns"]), axis=1)
+            x = x - reference.states(steps["t_ns"])
+        deviations = np.linalg.norm(x, axis=1)
         settled_norm = self.settle * deviations[0]
         if deviations[-1] <= settled_norm:
             row["settling_s"] = t_s[deviations > settled_norm].max(initial=0.0)
         row["final_norm"] = norms[-1]
+        if self.output is not None:
+            y = x[t_s >= self.from_s] @ measured_rows(record.scenario)[self.output]
+            row[OUTPUT_LARGEST] = np.abs(y).max(initial=0.0)
         row["cost"] = self._cost(record)
         # The controller's error, where it shares an update with the sensor.
         aligned = align_tables(record)
@@ -149,10 +162,24 @@ class SampledWork:
         return np.eye(n) if Q is None else Q, np.eye(m) if R is None else R
 
 
+def measured_rows(scenario: Scenario) -> Mapping[str, NDArray[np.float64]]:
+    """Return the rows of a loop's outputs and states, (n,), by their names."""
+    outputs = {output.name: np.array(output.row) for output in scenario.loop_outputs()}
+    names = scenario.named_model.state_names or ()
+    return {**dict(zip(names, np.eye(len(names)), strict=True)), **outputs}
+
+
 def in_virtual_time(scenario: Scenario) -> Scenario:
     """Return the scenario without the settings that do not affect its simulation."""
     sections = {"seeds": SeedsSection(), "ports": PortsSection(), "realtime": RealtimeSection()}
     return scenario.model_copy(update={"name": "campaign", "description": "", "speed": 1.0, **sections})
+
+
+OUTPUT_LARGEST = "output_largest"
+
+
+def _with_output(row: np.dtype[np.void]) -> np.dtype[np.void]:
+    return np.dtype([*row.descr, (OUTPUT_LARGEST, "<f8")])
 
 
 LOOPS_ROW = np.dtype(
@@ -177,6 +204,7 @@ _OF_ALL: Mapping[str, Callable[[NDArray[np.float64]], float]] = {
     "cost": np.mean,
     "sup_e_c_scaled": np.max,
     "final_norm": np.max,
+    OUTPUT_LARGEST: np.max,
 }
 
 
@@ -187,19 +215,25 @@ class SharedNetworkWork(SampledWork):
     Loop k of draw i has the same plant, initial state and phase for any number of loops.
     """
 
+    @property
+    def row_type(self) -> np.dtype[np.void]:
+        """The type of the rows of runs."""
+        return LOOPS_ROW if self.output is None else _with_output(LOOPS_ROW)
+
     def run(self, draws: range) -> NDArray[np.void]:
-        """Compute consecutive draws; one row of ``LOOPS_ROW`` each."""
-        rows = np.zeros(len(draws), LOOPS_ROW)
+        """Compute consecutive draws; one row of ``row_type`` each."""
+        rows = np.zeros(len(draws), self.row_type)
         for row, draw in zip(rows, draws, strict=True):
             seeds = seeds_of(self.seed, draw)
             run = ResolvedRun(self.scenario.model_copy(update={"seeds": seeds}))
             records = [*simulate_loops(run).loops]
-            loops = np.zeros(len(records), ROW)
+            loops = np.zeros(len(records), super().row_type)
             with np.errstate(all="ignore"):  # loops may diverge
                 for loop_row, record in zip(loops, records, strict=True):
                     self._measure(record, loop_row)
-            for name, of_all in _OF_ALL.items():
-                row[name] = of_all(loops[name])
+            for name in loops.dtype.names or ():
+                if name in _OF_ALL:
+                    row[name] = _OF_ALL[name](loops[name])
             row["diverged_at_s"] = np.nanmin(np.append(loops["diverged_at_s"], np.inf))
             row["status"] = OK
             row["cost_worst"] = np.max(loops["cost"])

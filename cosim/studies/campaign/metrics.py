@@ -41,7 +41,10 @@ Metric = Literal[
     "sup_e_c_scaled",
     "certificate_used",
     "final_norm",
+    "output_largest",
 ]
+OF_THRESHOLD: Metric = "sup_e_c_scaled"
+"""The metric in units of the threshold at t = 0: it is comparable where α and the norm are the same."""
 
 
 class Description(NamedTuple):
@@ -80,9 +83,10 @@ METRICS: Mapping[Metric, Description] = {
     "loops_failed": Description("share of loops that failed"),
     "updates_late": Description("share of updates that are late"),
     "delay_max_s": Description("largest delay in the network", "s", logarithmic=True),
-    "sup_e_c_scaled": Description("largest error", "", "sup ‖e_c‖ e^(αt)"),
+    "sup_e_c_scaled": Description("sup ‖e_c‖ e^(αt)"),
     "certificate_used": Description("share used", "%", "sup ‖e_c‖ e^(αt) / Δβ", scale=100.0),
     "final_norm": Description("final state", "", "‖x‖", logarithmic=True),
+    "output_largest": Description("largest |output|", "", "from metrics.from_s on", logarithmic=True),
 }
 
 

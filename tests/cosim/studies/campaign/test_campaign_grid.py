@@ -78,7 +78,7 @@ def test_an_invalid_scenario_at_a_point_is_reported_with_the_point(
     write: Write, plan: dict[str, Any]
 ) -> None:
     def mistake(changed: str) -> list[str]:
-        path = write(plan, **ALONE, **json.loads(changed))
+        path = write(plan, **(ALONE | json.loads(changed)))
         return lines_of_error(lambda: few_of(path), FOLDER=path.parent)
 
     compare_lines(Path(__file__).with_name("point_mistakes.txt"), mistake)

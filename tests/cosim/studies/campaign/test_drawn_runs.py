@@ -51,6 +51,18 @@ def record_of(sampled: SampledWork, draw: int) -> RunRecord:
     return simulate(drawn_scenario(sampled.scenario, sampled.seed, draw))
 
 
+@pytest.mark.parametrize(("name", "index"), [("lateral offset", 3), ("r", 1)])
+def test_the_largest_output_from_a_time_on_is_that_of_the_record(name: str, index: int) -> None:
+    sampled = work("controller.setpoint=[0.0, 0.0, 0.0, 2.0]", output=name, from_s=2.0)
+    (row,) = sampled.run(range(1))
+    steps = record_of(sampled, 0)["plant_step"]
+    distances = np.abs(steps["x"][:, index] - [0.0, 0.0, 0.0, 2.0][index])
+    late = steps["t_ns"] >= 2_000_000_000
+    assert row["output_largest"] == pytest.approx(distances[late].max())
+    assert 0 < row["output_largest"] < distances.max()
+    assert "output_largest" not in (work().row_type.names or ())
+
+
 def test_a_run_settles_at_its_setpoint() -> None:
     """‖x‖ stays near ‖x_r‖ = 20, so no such run settled by ‖x‖."""
     sampled = work("controller.setpoint=[0.0, 0.0, 0.0, 20.0]", "horizon_s=20.0")
