@@ -91,7 +91,7 @@ def proven(content: Document, document: Document) -> tuple[Loop, Proof] | None:
         return None
 
 
-@pytest.mark.parametrize("count", [24, pytest.param(240, marks=pytest.mark.deep)])
+@pytest.mark.parametrize("count", [36, pytest.param(240, marks=pytest.mark.deep)])
 def test_changed_witnesses_of_a_region_prove_nothing_false(count: int) -> None:
     content = resolved_content(resolve(load(SCENARIOS / "sine_pendulum.toml")))
     document = {key: value for key, value in proved("sine_pendulum").document.items() if key != "gains"}

@@ -49,7 +49,7 @@ def of(system: System) -> tuple[LoopMatrices, Theorem2]:
 
 
 @settings(SEARCH, max_examples=6)
-@given(systems(weighted=False))
+@given(systems())
 def test_theorem_2_is_what_its_equations_say(system: System) -> None:
     """Every quantity recomputed from eq:tau, eq:Htil and eq:normXt; F at t_i = 0 and far out."""
     loop, paper = of(system)
@@ -79,7 +79,7 @@ def test_theorem_2_is_what_its_equations_say(system: System) -> None:
 
 
 @settings(SEARCH, max_examples=2)
-@given(systems(weighted=False), seeds)
+@given(systems(), seeds)
 def test_theorem_2_is_never_exceeded_in_the_papers_loop(system: System, seed: int) -> None:
     loop, paper = of(system)
     horizon_s = 10.0 / float(np.abs(np.linalg.eigvals(system.H)).max())
