@@ -1,31 +1,42 @@
-"""``noack-check witness.json [--scenario resolved.toml]``: verifies a file of witnesses.
+"""``noack-check witness.json [--scenario resolved.toml] [--equations FILE]``: verifies a file of witnesses.
 
 Prints PROVED and what was proven, for each statement of the file, or REJECTED and the first inequality
 that fails. Exit status: 0 if all are proven, 1 if one is not, 2 for a file that cannot be read or written.
 
 The loop is derived from the scenario, as ``noack check NAME --resolved`` prints it; without it, from the
-copy in the witness's file. A copy that differs from the scenario is a rejection.
+copy in the witness's file. A copy that differs from the scenario is a rejection. A statement about a plant's
+equations is proven only of the equations in the file that --equations names, and prints their digest.
 """
 
 import argparse
-import json
 import os
 import sys
-import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from noack_check.check import RejectedError
+from noack_check.files import UnreadableError, read_json, read_text, read_toml
 from noack_check.growth import prove_growth, read_periodic_loop
 from noack_check.keys import RefusedError, Table
 from noack_check.proof import prove
 from noack_check.scenario import output_names, read_enclosed, read_loop
-from noack_check.sentences import assumptions, equations_text, growth_sentences, meaning, sentences
+from noack_check.sentences import (
+    assumptions,
+    digest_of_equations,
+    equations_text,
+    growth_sentences,
+    meaning,
+    quoted,
+    sentences,
+)
 
-_PLANTS = {"own": "its plant", "box": "all plants of its uncertainty box", "region": "its plant's equations"}
+_PLANTS = {
+    "own": "its plant",
+    "box": "all plants of its uncertainty box",
+    "region": "the plant with the equations",
+}
 _CONDITIONS = {"ideal": "ideal conditions", "schedule": "its schedule"}
-_LONGEST_NAME, _MOST_KEYS = 200, 5
-MOST_BYTES = 64 * 1024**2
+_LONGEST_NAME, _MOST_KEYS, _SHORT_DIGEST = 200, 5, 12
 
 
 def main() -> None:
@@ -37,19 +48,26 @@ def main() -> None:
         help="file that `noack certify NAME --witness FILE` or `noack margin` with --witness has written",
     )
     parser.add_argument("--scenario", type=Path, help="the scenario, by `noack check NAME --resolved`")
+    parser.add_argument(
+        "--equations",
+        type=Path,
+        help="the plant's equations, by `noack certify NAME --witness W --equations FILE`; a statement about "
+        "equations needs them",
+    )
     arguments = parser.parse_args()
     try:
-        file = _read(arguments.witness, "JSON", json.loads)
-        given = None if arguments.scenario is None else _read(arguments.scenario, "TOML", tomllib.loads)
+        file = read_json(arguments.witness)
+        given = None if arguments.scenario is None else read_toml(arguments.scenario)
+        equations = None if arguments.equations is None else read_text(arguments.equations)
     except UnreadableError as error:
-        print(f"noack-check: {error}", file=sys.stderr)
+        print(printable(f"noack-check: {error}"), file=sys.stderr)
         sys.exit(2)
     try:
-        for line in check_file(file, given):
-            print(line)
+        for line in check_file(file, given, equations):
+            print(printable(line))
         sys.stdout.flush()
     except (RejectedError, RefusedError) as error:
-        print(f"REJECTED {error}")
+        print(printable(f"REJECTED {error}"))
         sys.exit(1)
     except OSError as error:  # the output cannot be written
         if not isinstance(error, BrokenPipeError):
@@ -58,12 +76,13 @@ def main() -> None:
         sys.exit(2)
 
 
-def check_file(file: Table, given: Table | None) -> Iterator[str]:
+def check_file(file: Table, given: Table | None, equations: str | None = None) -> Iterator[str]:
     """Yield a line for each bound that a file of witnesses proves.
 
     Args:
         file: its content.
         given: the resolved scenario; None: the file's copy is used.
+        equations: text with the equations that statements may be about; None: none is.
 
     Raises:
         RejectedError: a statement is not proven, or the copy differs from the scenario.
@@ -93,20 +112,24 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
             raise RejectedError("a statement has no plants or conditions")
         if document.get("statement") == "growth" and (plants, conditions) != ("own", "schedule"):
             raise RejectedError("growth: is of the plant itself under its schedule")
-        of = f"{name}, {_PLANTS[plants]}, {_CONDITIONS[conditions]}"
+        of = f"{quoted(name)}, {_PLANTS[plants]}, {_CONDITIONS[conditions]}"
         if document.get("statement") == "growth":
             growth = prove_growth(read_periodic_loop(scenario), document)
             yield from (f"PROVED {of}, nothing late: {sentence}" for sentence in growth_sentences(growth))
             continue
         enclosed = read_enclosed(scenario, document) if plants == "region" else None
         loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal", enclosed=enclosed)
+        if enclosed is not None:
+            digest = digest_of_equations(document, equations)
+            of = f"{quoted(name)}, {_PLANTS[plants]} {digest[:_SHORT_DIGEST]}, {_CONDITIONS[conditions]}"
         for sentence in sentences(prove(loop, document), output_names(scenario)):
             yield f"PROVED {of}: {sentence}"
         if meant := meaning(scenario, loop):
             yield f"       where {meant}"
         yield f"       if there are {assumptions(scenario, loop)}"
         if enclosed is not None:
-            yield f"       and the plant is {equations_text(document)}"
+            rates = equations_text(document)
+            yield f"       and the plant has the equations with the SHA-256 {digest}: {rates}"
 
 
 def _differences(given: Table, scenario: Table) -> list[str]:
@@ -115,30 +138,9 @@ def _differences(given: Table, scenario: Table) -> list[str]:
     return sorted(key for key in keys if given.get(key) != scenario.get(key))
 
 
-class UnreadableError(ValueError):
-    """A file cannot be read; the message names it."""
-
-
-def _read(path: Path, kind: str, parse: Callable[[str], object]) -> Table:
-    """Return the table in a file of a kind, which ``parse`` reads.
-
-    Raises:
-        UnreadableError: there is none.
-    """
-    try:
-        with path.open("rb") as file:
-            content = file.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise UnreadableError(f"{path}: {error.strerror}") from None
-    if len(content) > MOST_BYTES:
-        raise UnreadableError(f"{path}: larger than {MOST_BYTES // 1024**2} MiB")
-    try:
-        found = parse(content.decode())
-    except (ValueError, RecursionError):
-        raise UnreadableError(f"{path}: not a {kind} file") from None
-    if not isinstance(found, dict):
-        raise UnreadableError(f"{path}: not a table")
-    return found
+def printable(text: str) -> str:
+    """Return a text as one line; characters that a terminal may act upon are escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 if __name__ == "__main__":

@@ -532,6 +532,23 @@ def read_region(document: Mapping[str, object], n: int, m: int) -> Region:
     return Region(*found)
 
 
+def equation_lines(equations: Mapping[str, object]) -> list[str]:
+    """Return equations, as :func:`enclose` accepts them, as text: a line for each step and each rate."""
+    steps, rates, names, lines = equations["steps"], equations["rates"], list[str](), list[str]()
+    assert isinstance(steps, list)
+    assert isinstance(rates, list)
+    for name, *rest in steps:
+        formula = _formula(name, rest, names)
+        if name in ("positive", "nonnegative"):
+            lines.append(f"{formula} {'>' if name == 'positive' else '≥'} 0")
+        elif name not in ("state", "input", "time", "number"):
+            plain = formula[1:-1] if formula.startswith("(") else formula
+            lines.append(f"s_{len(names) + 1} = {plain}")
+            formula = f"s_{len(names) + 1}"
+        names.append(formula)
+    return lines + [f"dx_{i + 1}/dt = {names[index]}" for i, index in enumerate(rates)]
+
+
 _INFIX = {"add": " + ", "times": " · "}
 
 
@@ -565,5 +582,5 @@ def _formula(name: str, rest: Sequence[object], texts: Sequence[str]) -> str:
     if name in ("positive", "nonnegative"):
         return operands[0]
     if name == "root":
-        return f"√{operands[0]}"
+        return f"sqrt({operands[0]})"
     return f"{name}({', '.join([*operands, *map(str, rest[count:])])})"

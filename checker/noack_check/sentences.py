@@ -1,5 +1,8 @@
 """What was proven, in words; decimals are rounded so that the sentences stay true."""
 
+import hashlib
+import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
@@ -7,8 +10,9 @@ from math import isfinite
 
 from flint import arb, fmpq
 
+from noack_check.check import RejectedError
 from noack_check.document import read_table
-from noack_check.equations import formulas
+from noack_check.equations import equation_lines, formulas
 from noack_check.growth import Growth
 from noack_check.loop import Loop
 from noack_check.proof import Bound, Proof
@@ -17,6 +21,7 @@ from noack_check.scenario import most_losses
 _SHORT = 7
 """Longest decimal number that is printed as it is, if it stands for exactly that number."""
 _LONGEST_EQUATIONS = 600
+_PLAIN_NAME = re.compile(r"[\w-]+")
 _NAMES = {"x": "‖x‖", "e_s": "‖W e_s‖", "e_c": "‖W e_c‖", "drift": "‖W(ẋ − Hx)‖"}
 
 
@@ -80,12 +85,34 @@ def meaning(scenario: Mapping[str, object], loop: Loop) -> str:
     return ", and ".join(parts)
 
 
+def digest_of_equations(document: Mapping[str, object], given: str | None) -> str:
+    """Return the SHA-256 of the equations in a document that was accepted, which a statement is about.
+
+    Args:
+        document: the statement's document.
+        given: the text with the equations, one or more blocks of lines; None: there is none.
+
+    Raises:
+        RejectedError: the document's equations are not among them.
+    """
+    lines = equation_lines(read_table(document, "equations"))
+    digest = hashlib.sha256(("\n".join(lines) + "\n").encode()).hexdigest()
+    if given is None:
+        raise RejectedError(
+            f"the statement is about equations with the digest {digest}: give the file that has them with "
+            "--equations FILE; `noack certify NAME --witness W --equations FILE` writes it"
+        )
+    blocks = [[line.rstrip() for line in block.splitlines()] for block in given.split("\n\n")]
+    if lines not in ([line for line in block if line] for block in blocks):
+        raise RejectedError(f"the statement is about other equations than --equations: digest {digest}")
+    return digest
+
+
 def equations_text(document: Mapping[str, object]) -> str:
-    """Return the equations of a plant in a document that was accepted, which a statement is about."""
-    equations = read_table(document, "equations")
-    rates = [f"dx_{i + 1}/dt = {formula}" for i, formula in enumerate(formulas(equations))]
-    text = ", ".join(rates)
-    return text if len(text) <= _LONGEST_EQUATIONS else "that of the equations in the witness's file"
+    """Return the equations in a document that was accepted, or where they are."""
+    rates = formulas(read_table(document, "equations"))
+    text = ", ".join(f"dx_{i + 1}/dt = {formula}" for i, formula in enumerate(rates))
+    return text if len(text) <= _LONGEST_EQUATIONS else "that of the equations in the file"
 
 
 def sentences(proof: Proof, outputs: Sequence[str] = ()) -> Iterator[str]:
@@ -126,7 +153,15 @@ def norm(output: str, outputs: Sequence[str] = ()) -> str:
     if output in _NAMES:
         return _NAMES[output]
     kind, index = output[0], int(output[2:].removesuffix("]"))
-    return f"|{outputs[index] if outputs and kind == 'y' else f'{kind}_{index + 1}'}|"
+    if not outputs or kind != "y":
+        return f"|{kind}_{index + 1}|"
+    name = outputs[index]
+    return f"|{name if _PLAIN_NAME.fullmatch(name) else quoted(name)}|"
+
+
+def quoted(name: str) -> str:
+    """Return a name in quotes, in which it cannot end."""
+    return json.dumps(name, ensure_ascii=False)
 
 
 def _exception(proof: Proof) -> str:

@@ -33,7 +33,8 @@ from noack.theory.witnesses.regions import (
     region_witness_by_gains,
 )
 from noack_check.check import RejectedError
-from noack_check.equations import read_region
+from noack_check.document import read_table
+from noack_check.equations import equation_lines, read_region
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
 from noack_check.proof import Proof, prove
@@ -88,6 +89,13 @@ class Witnesses(NamedTuple):
         """Return the file that ``noack-check`` reads."""
         documents = [s.document for s in self.statements if s.document is not None]
         return json.dumps({"scenario": self.scenario, "statements": documents}, allow_nan=False)
+
+    def equations_text(self) -> str:
+        """Return the equations that the statements are about, for ``noack-check --equations``."""
+        documents = [s.document for s in self.statements if s.document is not None]
+        found = [equation_lines(read_table(d, "equations")) for d in documents if "equations" in d]
+        blocks = dict.fromkeys("".join(f"{line}\n" for line in lines) for lines in found)
+        return "\n".join(blocks)
 
 
 def plants_of(resolved: Scenario) -> list[str]:

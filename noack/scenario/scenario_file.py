@@ -30,6 +30,7 @@ from noack.scenario.toml_file import keys as known_keys
 from noack.scenario.toml_file import nearest_key
 from noack.settings.section import ReadTable, ScenarioSection, Table
 from noack.settings.user_files import NamedFile, file_tables, with_absolute_path, with_tables
+from noack_check.files import MOST_LEVELS
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
@@ -379,8 +380,8 @@ def put(content: Table, key: str, value: object, source: str) -> None:
     if value is None:
         _remove(content, full_key(key), source)
         return
-    if len(path) >= toml_file.MOST_LEVELS:
-        raise CallerError(f"{source}: the key has more than {toml_file.MOST_LEVELS} parts")
+    if len(path) >= MOST_LEVELS:
+        raise CallerError(f"{source}: the key has more than {MOST_LEVELS} parts")
     for depth, part in enumerate(path):
         if isinstance(table, dict):
             table = table.setdefault(part, {})

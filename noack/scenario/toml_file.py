@@ -23,33 +23,20 @@ from noack.core.errors import TOO_LARGE, CallerError, did_you_mean, plain_mistak
 from noack.core.extension_points import missing_extension
 from noack.core.file_access import read_regular
 from noack.settings.section import ReadTable, ScenarioSection, Table
+from noack_check.files import MOST_LEVELS, TOO_DEEP, TooLargeError, parse_toml
 
 M = TypeVar("M", bound=ScenarioSection)
 Kind: TypeAlias = object
 """The annotation of a value: a class, a union, a list."""
 
 MOST_BYTES = 2**20  # largest size of a settings file
-MOST_LEVELS = 32  # largest number of parts of a dotted key, and of nested tables and lists
 
-_STRING = re.compile(
-    r"""
-      (?P<comment> \# [^\n]*+ )
-    | \"{3} (?: [^"\\] | \\.? | "(?!"") )*+ (?: \"{3,5} )?
-    | '{3} (?: [^'] | '(?!'') )*+ (?: '{3,5} )?
-    | " (?: [^"\\\n] | \\[^\n]? )*+ "?
-    | ' [^'\n]*+ '?
-    """,
-    re.VERBOSE | re.DOTALL,
-)
-"""Strings and comments of TOML; an unterminated one ends at the last possible place."""
 _PLACE = re.compile(r" \(at (?:line (\d+), column \d+|end of document)\)$")
 """The end of :mod:`tomllib`'s messages."""
 _KEY = re.compile(r"\s*(?:[\w.'\"-]+\s*=|\[+\s*[A-Za-z_'\"])")
 """A line that begins with a key or the head of a table."""
-_TOO_DEEP = f"tables and lists lie within each other more than {MOST_LEVELS} levels deep"
 _MOST_LOOKED_AT = 100
 """Files beside a missing one that may be suggested instead."""
-_LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_LEVELS}}}")
 
 
 def read(path: Path, model: type[ScenarioSection] = ScenarioSection, most_bytes: int = MOST_BYTES) -> Table:
@@ -97,29 +84,21 @@ def _why_not_read(path: Path, error: OSError | ValueError) -> str:
 def parsed(text: str, source: str) -> Table:
     """Parse TOML; ``source`` names it in error messages.
 
-    :mod:`tomllib` needs memory for n² parts for a key of n parts. So keys with too many parts are
-    refused before the text is parsed.
-
     Raises:
-        CallerError: the text is not TOML, or a key in it has too many parts.
+        CallerError: the text is not TOML, or exceeds a limit.
     """
-    masked = _STRING.sub(lambda match: "" if match["comment"] else "_", text)
-    if _LONG_KEY.search(masked):
-        raise CallerError(f"{source}: a key has more than {MOST_LEVELS} parts")
     try:
-        return tomllib.loads(text)
-    except RecursionError:
-        raise CallerError(f"{source}: {_TOO_DEEP}") from None
+        return parse_toml(text)
+    except TooLargeError as error:
+        raise CallerError(f"{source}: {error}") from None
     except tomllib.TOMLDecodeError as error:
         raise CallerError(printable(f"{source}: not valid TOML: {_with_line(text, str(error))}")) from None
-    except ValueError:  # an integer has thousands of digits
-        raise CallerError(f"{source}: {TOO_LARGE}") from None
 
 
 def validated(model: type[M], content: ReadTable, source: str) -> M:
     """Validate parsed content; raise CallerError with one line per mistake, named by ``source``."""
     if _is_deeper(content, MOST_LEVELS):
-        raise CallerError(f"{source}: {_TOO_DEEP}")
+        raise CallerError(f"{source}: {TOO_DEEP}")
     try:
         text = json.dumps(content, default=_unfit)
     except TypeError as error:

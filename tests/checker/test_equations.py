@@ -1,6 +1,7 @@
 """The equations of plants on a region: their enclosure, and witnesses of what stays in it."""
 
 import copy
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from noack.scenario.scenario_file import load
 from noack.theory.witnesses.coordinates import floats
 from noack_check.__main__ import check_file
 from noack_check.check import RejectedError
-from noack_check.equations import LinearPlants, enclose
+from noack_check.equations import LinearPlants, enclose, equation_lines
 from noack_check.keys import RefusedError
 from noack_check.loop import Region
 from tests.checker.proofs import proved
@@ -170,9 +171,42 @@ def witness() -> dict[str, Any]:
 
 
 def test_a_region_is_proven_with_the_equations_in_words(witness: dict[str, Any]) -> None:
-    lines = [*check_file(witness, None)]
+    lines = [*check_file(witness, None, text_of(witness))]
     assert any("|x_1| ≤ " in line for line in lines)
+    digest = hashlib.sha256(text_of(witness).encode()).hexdigest()
+    assert lines[0].startswith(f'PROVED "sine_pendulum", the plant with the equations {digest[:12]}, ideal')
+    assert lines[-1].startswith(
+        f"       and the plant has the equations with the SHA-256 {digest}: dx_1/dt = "
+    )
     assert lines[-1].endswith("dx_2/dt = (((sin(x_1) · 9.81) + (−(x_2 · 0.1))) + u_1)")
+
+
+def text_of(witness: dict[str, Any]) -> str:
+    """Return the equations of a witness, as ``noack certify --equations`` writes them."""
+    return "".join(f"{line}\n" for line in equation_lines(witness["statements"][0]["equations"]))
+
+
+def test_equations_are_read_line_by_line(witness: dict[str, Any]) -> None:
+    assert text_of(witness).splitlines() == [
+        "s_5 = sin(x_1)", "s_7 = s_5 · 9.81", "s_9 = x_2 · 0.1", "s_10 = −s_9", "s_11 = s_7 + s_10",
+        "s_12 = s_11 + u_1", "dx_1/dt = x_2", "dx_2/dt = s_12",
+    ]  # fmt: skip
+
+
+def test_a_statement_about_equations_demands_their_file(witness: dict[str, Any]) -> None:
+    with pytest.raises(RejectedError, match=r"equations with the digest [0-9a-f]{64}: give the file"):
+        list(check_file(witness, None))
+    other = text_of(witness).replace("9.81", "9.8")
+    with pytest.raises(RejectedError, match="about other equations than --equations: digest"):
+        list(check_file(witness, None, other))
+    several = f"{other}\n{text_of(witness)}"
+    assert any(line.startswith("PROVED") for line in check_file(witness, None, several))
+    weaker = copy.deepcopy(witness)
+    steps = weaker["statements"][0]["equations"]["steps"]
+    [gravity] = [step for step in steps if step[:1] == ["number"] and step[1] > 9]
+    gravity[1] *= 0.5
+    with pytest.raises(RejectedError, match="about other equations"):
+        list(check_file(weaker, None, text_of(witness)))
 
 
 def change(document: Any, place: tuple[Any, ...], value: Any) -> None:
@@ -203,7 +237,7 @@ def test_false_witnesses_of_a_region_are_rejected(
     changed = copy.deepcopy(witness)
     change(changed["statements"][0], place, value)
     with pytest.raises(ValueError, match=reason):
-        list(check_file(changed, None))
+        list(check_file(changed, None, text_of(changed)))
 
 
 @pytest.mark.parametrize("names", [["angle"], ["angle", "rate", "time"]])
@@ -212,7 +246,7 @@ def test_each_state_has_a_name_or_none_has(witness: dict[str, Any], names: list[
     del changed["scenario"]["outputs"]
     changed["scenario"]["model"]["state_names"] = names
     with pytest.raises(RefusedError, match="not 2 names"):
-        list(check_file(changed, None))
+        list(check_file(changed, None, text_of(changed)))
 
 
 def test_a_stronger_nonlinearity_is_another_plant(witness: dict[str, Any]) -> None:
@@ -221,7 +255,7 @@ def test_a_stronger_nonlinearity_is_another_plant(witness: dict[str, Any]) -> No
     [gravity] = [step for step in steps if step[:1] == ["number"] and step[1] > 9]
     gravity[1] *= 1.1
     with pytest.raises(RejectedError, match="flow/"):
-        list(check_file(changed, None))
+        list(check_file(changed, None, text_of(changed)))
 
 
 def test_a_bound_of_a_region_has_to_be_there_from_the_start_on(witness: dict[str, Any]) -> None:
@@ -230,7 +264,7 @@ def test_a_bound_of_a_region_has_to_be_there_from_the_start_on(witness: dict[str
     bounds = changed["statements"][0]["bounds"]
     changed["statements"][0]["bounds"] = [entry for entry in bounds if entry["output"] != "x[0]"]
     with pytest.raises(RejectedError, match=r"region: x\[0\] has no bound"):
-        list(check_file(changed, None))
+        list(check_file(changed, None, text_of(changed)))
 
 
 SATURATED = """import numpy as np
@@ -259,8 +293,9 @@ def test_a_saturated_input_is_proven_to_stay_inside_its_limits(
     assert isinstance(bounds, list)
     del statement.document["gains"]  # they bound u[0], too, but not below its limit
     less = {**statement.document, "bounds": [entry for entry in bounds if entry["output"] != "u[0]"]}
+    file = {"scenario": content, "statements": [less]}
     with pytest.raises(RejectedError, match=r"region: u\[0\] has no bound"):
-        list(check_file({"scenario": content, "statements": [less]}, None))
+        list(check_file(file, None, text_of(file)))
 
 
 def test_no_attack_exceeds_what_is_proven_on_a_region() -> None:

@@ -385,7 +385,7 @@ def test_the_command_writes_what_noack_check_proves(tmp_path: Path) -> None:
     result = invoke("margin", *words, "--witness", str(path))
     assert result.stdout.count("proved by noack-check: with") == 2
     lines = list(check_file(json.loads(path.read_text()), None))
-    start = "PROVED unstable_pendulum, its plant, its schedule, nothing late: "
+    start = 'PROVED "unstable_pendulum", its plant, its schedule, nothing late: '
     assert [line.startswith(start) for line in lines] == [True, True]
     file = json.loads(path.read_text())
     file["statements"][0]["plants"] = "box"

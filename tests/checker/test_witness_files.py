@@ -1,6 +1,7 @@
 """``noack certify NAME --witness FILE`` and ``noack-check FILE``, from the command line."""
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from noack_check.check import RejectedError
 from noack_check.scenario import read_loop
 from noack_check.sentences import assumptions, meaning
 from tests.helpers.resolved_tables import resolved_tables
+
+CASES = Path(__file__).parent.parent / "cases"
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +64,7 @@ def test_the_program_prints_what_is_proven(
     status, text = run(capsys, monkeypatch, str(file))
     assert status == 0
     lines = text.splitlines()
-    proven = [line for line in lines if line.startswith("PROVED unstable_pendulum, ")]
+    proven = [line for line in lines if line.startswith('PROVED "unstable_pendulum", ')]
     assumed = [line for line in lines if line.startswith("       if there are at most 3 consecutive losses")]
     assert (len(lines), len(assumed)) == (len(proven) + 4, 4)
     bound = re.search(r"its plant, its schedule: ‖x‖ ≤ (\S+) e", text)
@@ -141,6 +144,70 @@ def test_files_that_are_no_witness_are_one_line(
     status, printed = run(capsys, monkeypatch, str(path))
     assert status in (1, 2)
     assert len(printed.splitlines()) == 1
+
+
+def test_control_characters_do_not_reach_the_terminal(
+    file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    status, text = run(capsys, monkeypatch, str(CASES / "witness_escape.json"))
+    assert status == 1
+    assert text.removesuffix("\n").isprintable()
+    assert r"controller.reference.\x1b]0;owned\x07\x1b[31m: no statement covers this key" in text
+    status, text = run(capsys, monkeypatch, "\x1b[31m\u202e.json")
+    assert (status, text.removesuffix("\n").isprintable()) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("name", "begins"),
+    [
+        (
+            "lane_following, its plant, its schedule: ‖x‖ ≤ 0.001 e^(−9 t). Copy of g43",
+            'PROVED "lane_following, its plant, its schedule: ‖x‖ ≤ 0.001 e^(−9 t). Copy of g43", its plant',
+        ),
+        ('a", its plant: ‖x‖ ≤ 0', r'PROVED "a\", its plant: ‖x‖ ≤ 0", its plant'),
+    ],
+)
+def test_a_name_that_reads_like_a_statement_is_quoted(file: Path, name: str, begins: str) -> None:
+    content = json.loads(file.read_text())
+    content["scenario"]["name"] = name
+    lines = [line for line in check_file(content, None) if line.startswith("PROVED")]
+    assert all(line.startswith(begins) for line in lines)
+
+
+def test_a_name_of_an_output_that_reads_like_a_bound_is_quoted(file: Path) -> None:
+    content = json.loads(file.read_text())
+    content["scenario"]["outputs"][0]["name"] = "z| ≤ 1e-9, so |y"
+    assert any('|"z| ≤ 1e-9, so |y"| ≤ ' in line for line in check_file(content, None))
+
+
+def test_a_fifo_and_a_device_are_refused(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.mkfifo(fifo := tmp_path / "fifo")
+    for words in ([fifo], [file, "--scenario", fifo], [file, "--equations", fifo], ["/dev/zero"]):
+        status, text = run(capsys, monkeypatch, *map(str, words))
+        assert (status, text.endswith(": not a regular file\n")) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (".".join("a" * 2000) + " = 1", "a key has more than 32 parts"),
+        ("[" + ". ".join(['"a"'] * 2000) + "]", "a key has more than 32 parts"),
+        ("a = " + "[" * 2000, "levels deep"),
+        ("a = " + "1" * 5000, "an integer is too large"),
+        ("a = ", "not a TOML file"),
+    ],
+)
+def test_a_scenario_beyond_the_limits_is_refused_before_it_is_parsed(
+    text: str, reason: str, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    given = tmp_path / "given.toml"
+    given.write_text(text)
+    status, printed = run(capsys, monkeypatch, str(file), "--scenario", str(given))
+    assert (status, len(printed.splitlines())) == (2, 1)
+    assert reason in printed
 
 
 @pytest.mark.parametrize(

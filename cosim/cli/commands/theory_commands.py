@@ -68,6 +68,14 @@ def certify(
             "noack-check.",
         ),
     ] = None,
+    equations: Annotated[
+        Path | None,
+        Option(
+            callback=opt.usable_path,
+            help="Write the plant's equations that the witnesses are about to this file, for noack-check "
+            "--equations.",
+        ),
+    ] = None,
     search: Annotated[
         bool,
         Option(
@@ -106,9 +114,13 @@ def certify(
 
     if out is not None:
         require_suffix(out, "--out", ".mat")
+    if equations is not None and witness is None:
+        raise CallerError("--equations: the equations are those of the witnesses; add --witness FILE")
     loaded = opt.load_loop(scenario, settings, loop, network)
     if witness is not None:
-        require_covered(resolve(loaded))
+        require_covered(own := resolve(loaded))
+        if equations is not None and own.coverage.is_linear:
+            raise CallerError("--equations: the plant is linear; its statements need no file of equations")
     with uncovered_as_unmet(require or ()):
         result = certificates_of(loaded, late)
     with work_bar("searching for proofs" if search else "proving", lines=True) as bar:
@@ -116,6 +128,9 @@ def certify(
     if witness is not None and witnesses.are_any:
         write_output(witness, witnesses.file_text())
         print_to_stderr(f"noack: wrote {witness}, which noack-check verifies")
+        if equations is not None:
+            write_output(equations, witnesses.equations_text())
+            print_to_stderr(f"noack: wrote {equations}; compare it with the plant's code")
     if search:
         with work_bar("trying smaller thresholds", lines=True) as bar:
             result.advise(bar)
