@@ -86,7 +86,7 @@ class MeanCost:
         cost = self.with_guarantee
         if isinstance(cost, str):
             return cost
-        text = f"mean cost until {self.horizon_s:g} s: {number(cost.horizon_cost, 6)}"
+        text = f"computed mean cost until {self.horizon_s:g} s: {number(cost.horizon_cost, 6)}"
         if cost.grows:
             text += f"; the second moments grow by {cost.growth:.6g} per period"
         if (per_s := cost.stationary.cost_per_s) is not None:

@@ -350,7 +350,8 @@ def mean_cost_document(cost: MeanCost) -> Document:
     note = (
         "The cost is ∫ xᵀQx + uᵀRu dt, between the samples, too; u: of the controller. "
         "Rms: stationary, what the loop tends to from any start, over time. Growth below 1: stable "
-        "in mean square; z: the loop's state, x, x_c and the inputs in use."
+        "in mean square; z: the loop's state, x, x_c and the inputs in use. All numbers are computed, not "
+        "proved."
     )
     blocks.append(Sentence(text=note, role=SentenceRole.NOTE))
     return Document(title=cost.scenario, data=cost.to_json(), blocks=blocks)
@@ -361,7 +362,7 @@ def mean_cost_tables(costs: MeanCost) -> Iterator[ResultTable]:
     both = (costs.with_guarantee, costs.without_guarantee)
     known = [cost for cost in dict.fromkeys(both) if isinstance(cost, CostUnder)]
     mode = "model-based" if costs.mode == "model" else "zero-order hold"
-    title = f"{costs.scenario}: moments and cost, with an update every {costs.period_s:g} s, {mode}"
+    title = f"{costs.scenario}: computed moments and cost, with an update every {costs.period_s:g} s, {mode}"
     headings = ["", *(cost.guarantee for cost in known)]
     rows = [("growth of √E‖z‖² per period", *(f"{cost.growth:.6g}" for cost in known))]
 

@@ -227,6 +227,7 @@ class ClaimVerdict(StrEnum):
 
 
 NO_BOUND = "none"
+_IDENTITY = "(I1)"
 """The formula of a claim that has no bound."""
 
 
@@ -258,8 +259,10 @@ class Claim(SummaryPart):
 
     @property
     def origin(self) -> str:
-        """The source, and how the bound is known."""
-        return f"{self.source} (proved)" if self.proved else self.source
+        """The source, and how the bound is known; the identity (I1) is a definition."""
+        if self.proved:
+            return f"{self.source} (proved)"
+        return f"{self.source} (computed)" if self.has_bound and self.source != _IDENTITY else self.source
 
     @property
     def is_certified(self) -> bool:

@@ -5,7 +5,7 @@ without a limit on consecutive losses. From one transmission to the next the sta
 M₁z, so the second moments follow a linear map.
 
 1. ``mean_square_growth.py``. Its spectral radius decides stability in mean square; the bound of the
-   radius is proven with all rounding.
+   radius is computed with all rounding enclosed.
 2. ``exact_moments.py``. The same map with disturbances and noise has the stationary moments and the
    mean cost.
 

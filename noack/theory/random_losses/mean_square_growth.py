@@ -10,8 +10,9 @@ X_j = E[z zᵀ; state j] therefore follow
 and E‖z‖² grows exactly like the powers of this operator's spectral radius.
 
 The spectral radius is computed in double precision, in coordinates of the maps' common range. That
-it is below a bound γ is proven: for some X_j > 0 the operator's image is below γ X_j, with all
-rounding enclosed, in coordinates of all states (:meth:`PeriodMaps.prove_below`).
+it is below a bound γ is tested: for some X_j > 0 the operator's image is below γ X_j, with all
+rounding enclosed, in coordinates of all states (:meth:`PeriodMaps.is_below`). noack-check does not verify it,
+so the growth is called computed.
 """
 
 from collections.abc import Sequence
@@ -41,7 +42,7 @@ _MOST_SLOTS = 100
 _MOST_DENSE = 500
 """Size up to which all eigenvalues are computed."""
 _ABOVE = (1e-7, 1e-6, 1e-5, 1e-4)
-"""The bound of the spectral radius is the first of these shares above the computed one that is proven."""
+"""The bound of the spectral radius is the first of these shares above it that passes the test."""
 _SMALLEST = 1e-30
 """Smallest bound of a spectral radius that is tried."""
 _OTHERS = 1e-3
@@ -60,7 +61,7 @@ class MeanSquareGrowth(NamedTuple):
         verdict = "stable" if self.per_period < 1 else "not stable"
         return (
             f"√E‖z‖² of the loop's state z changes by the factor {self.per_period:.6g} per period: "
-            f"{verdict} in mean square"
+            f"{verdict} in mean square (computed)"
         )
 
 
@@ -180,12 +181,12 @@ class PeriodMaps(NamedTuple):
                 solution = from_triangles(solve_resolvent(operator, bound, identity), size)
             except RuntimeError:  # singular by rounding
                 continue
-            if self.prove_below(bound, solution, outcomes):
+            if self.is_below(bound, solution, outcomes):
                 return bound
         raise NotPredictableError("the second moments could not be bounded numerically")
 
-    def prove_below(self, bound: float, forms: Stack, outcomes: OutcomeChain) -> bool:
-        """Return whether X_j > 0 with operator(X) < bound X prove that a bound is one.
+    def is_below(self, bound: float, forms: Stack, outcomes: OutcomeChain) -> bool:
+        """Return whether X_j > 0 with operator(X) < bound X show that a bound is one.
 
         Args:
             bound: γ
@@ -210,7 +211,7 @@ class PeriodMaps(NamedTuple):
 
 
 def _is_positive(forms: IntervalMatrix) -> bool:
-    """Return whether symmetric matrices are proven to be positive definite, (k, N, N).
+    """Return whether symmetric matrices are positive definite in interval arithmetic, (k, N, N).
 
     R, the inverse of a computed triangular factor, makes each nearly the identity; R X Rᵀ differs
     from it by less than 1 in the norm of the largest row sum.
