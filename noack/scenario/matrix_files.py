@@ -9,7 +9,6 @@ u = -K x: what they return as a whole has the right sign, a matrix alone is take
 """
 
 import io
-import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path

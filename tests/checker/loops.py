@@ -7,6 +7,7 @@ from it has one state, and closed forms.
 import json
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from flint import arb, fmpq
@@ -291,7 +292,20 @@ TESTED_APART: dict[str, Callable[[], Loop]] = {
 }
 
 
-# Settings of shipped scenarios.
+# Loops and settings of shipped scenarios.
+
+SERVO = "servo_reference"
+
+
+def servo(*settings: str) -> dict[str, Any]:
+    """Return the tables of the servo that follows a reference."""
+    return resolved_tables(SERVO, *settings)
+
+
+def loop_with(tables: dict[str, Any], *, box: bool = True, **times: fmpq) -> Loop:
+    """Return the loop of some tables, with some times that are at least these."""
+    return read_loop(tables, box=box, ideal=False, longer=times)
+
 
 FILTERED_MASS = (
     "plant={initial_state=[1.0,0.0],rate_hz=100.0,measurement={C=[[1.0,0.0]],noise_bound=[0.0005]}}",

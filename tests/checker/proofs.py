@@ -18,7 +18,7 @@ from flint import arb, fmpq
 from cosim.analysis.witness_store import WitnessStore
 from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
 from noack.theory.certificates.proven_bounds import ProvenBounds
-from noack.theory.witnesses.documents import Witness, find_witness
+from noack.theory.witnesses.documents import Witness, find_witness, witness_by_gains
 from noack.theory.witnesses.outward import proven_bounds
 from noack_check.balls import matrix
 from noack_check.loop import Loop
@@ -212,6 +212,17 @@ SEARCHES: dict[str, OfLoop | OfScenario] = {
     "sine_pendulum_schedule": OfScenario("sine_pendulum", ("network.mansd=2",), "region", "schedule"),
 }
 """By name, all proofs that are stored."""
+
+
+OUTPUTS = ("x", "e_s", "e_c", "x[0]", "y[0]", "u[0]")
+"""What bounds by gains are of."""
+
+
+def by_gains(loop: Loop) -> tuple[Document, Proof]:
+    """Return the document of a loop that is found by gains, without a search, and what it proves."""
+    is_moved = loop.push_before_input is not None
+    witness = witness_by_gains(loop, [name for name in OUTPUTS if not (is_moved and name[0] == "u")])
+    return dict(witness.document), witness.proof
 
 
 @functools.cache

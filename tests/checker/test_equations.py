@@ -2,7 +2,6 @@
 
 import copy
 import hashlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +10,19 @@ import pytest
 from flint import arb
 
 from cosim.analysis.witnesses import find_statement, resolved_content
-from noack.core.linear_systems import Matrix, Vector
 from noack.plants.systems.traced_equations import NotEnclosedError, trace
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.witnesses.coordinates import floats
 from noack_check.__main__ import check_file
 from noack_check.check import RejectedError
-from noack_check.equations import LinearPlants, enclose, equation_lines
+from noack_check.equations import enclose, equation_lines
 from noack_check.keys import RefusedError
 from noack_check.loop import Region
 from tests.checker.proofs import proved
+from tests.checker.traced_plants import Field, Plant, unexplained
 from tests.oracles.attacked_regions import SCENARIOS, largest_shares, largest_sizes, pendulum
 
-Field = Callable[[Any, Any], Any]
 FIELDS: dict[str, Field] = {
     "Coulomb friction": lambda x, u: [x[1], u[0] - 2 * x[0] - 0.3 * np.sign(x[1]) + 0.1 * x[1] ** 3],
     "friction with a bend": lambda x, u: [x[1], u[0] * np.cos(x[0]) - 0.4 * np.tanh(20 * x[1])],
@@ -33,47 +31,6 @@ FIELDS: dict[str, Field] = {
     "an outlet": lambda x, u: [np.sqrt(np.maximum(x[0] + 1, 0)) - 1 - x[1], u[0] / (2 + x[0]) - x[1]],
     "a sign of two states": lambda x, u: [x[1], np.exp(-x[0]) * np.sign(x[0] + x[1]) + u[0]],
 }
-
-
-class Plant:
-    """A plant with equations."""
-
-    def __init__(self, field: Field) -> None:
-        self.field = field
-
-    def expressions(self, t_s: Any, x: Any, u: Any) -> Any:
-        """See :meth:`noack.plants.plant_settings.OdeSystem.expressions`."""
-        return self.field(x, u), x
-
-
-def unexplained(plants: LinearPlants, field: Field, z: Matrix) -> Vector:
-    """Return by how much ẋ is outside the plants, for the best signals by a linear program, at points."""
-    from scipy.optimize import linprog
-
-    A, B, half_A, half_B, D = (floats(M) for M in plants[:5])
-    n, k = len(A), D.shape[1]
-    missed = []
-    for point in z:
-        x, u = point[:n], point[n:]
-        left = np.array(field(x, u), dtype=float) - A @ x - B @ u
-        room = half_A @ np.abs(x) + half_B @ np.abs(u) + 1e-9
-        # p with |p| ≤ 1 and p·Cz ≥ k p², so that p is between 0 and Cz/k: |left − D p| ≤ room.
-        limits = []
-        for row, least in plants.along:
-            along = float((floats(row) @ point)[0])
-            if not floats(row).any():
-                limits.append((-1.0, 1.0))
-                continue
-            most = 1.0 if float(least) == 0 else min(abs(along) / float(least), 1.0)
-            limits.append(
-                (0.0, most + 1e-9) if along > 0 else (-most - 1e-9, 0.0) if along < 0 else (-1.0, 1.0)
-            )
-        columns = np.vstack([np.hstack([s * D, -np.ones((n, 1))]) for s in (1, -1)])
-        sides = np.concatenate([left + room, room - left])
-        answer = linprog([0.0] * k + [1.0], columns, sides, bounds=[*limits, (None, None)])
-        assert answer.x is not None
-        missed.append(answer.x[-1])
-    return np.array(missed)
 
 
 @pytest.mark.parametrize("name", FIELDS)

@@ -23,19 +23,12 @@ from noack_check.responses import Decay, responses, responses_until
 from noack_check.sentences import smallest_bounds
 from noack_check.times import Schedule
 from tests.checker.loops import AREA, DUE, IDEAL, SCHEDULE, changed, double_integrator, scalar, with_form
-from tests.checker.proofs import proved
+from tests.checker.proofs import OUTPUTS, by_gains, proved
 from tests.checker.random_loops import KINDS, random_loop
 from tests.checker.runs import exceeded
 
-OUTPUTS = ("x", "e_s", "e_c", "x[0]", "y[0]", "u[0]")
 _ACCURACY, _OF_A_STIFF_ONE, _OF_QUADRATURE = 0.03, 0.5, 1e-4
 """Of enclosed responses, of a fast state beside a slow one, and of a sum over a fine grid, relatively."""
-
-
-def by_gains(loop: Loop) -> tuple[dict[str, Any], Proof]:
-    is_moved = loop.push_before_input is not None
-    witness = witness_by_gains(loop, [name for name in OUTPUTS if not (is_moved and name[0] == "u")])
-    return dict(witness.document), witness.proof
 
 
 def sizes(proof: Proof, *, from_start: bool = True) -> dict[str, float]:

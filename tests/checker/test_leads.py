@@ -14,11 +14,10 @@ from noack_check.model import Model
 from noack_check.proof import Proof, prove
 from noack_check.sentences import assumptions
 from tests.checker.completed import completed
+from tests.checker.loops import double_integrator, loop_with, servo
+from tests.checker.proofs import by_gains
 from tests.checker.random_loops import random_loop
 from tests.checker.runs import exceeded, floats
-from tests.checker.test_gains import by_gains
-from tests.checker.test_references import loop_with, servo
-from tests.checker.test_witnesses import double_integrator
 
 AGE, LEAD = fmpq(3, 100), fmpq(1, 10)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
-from cosim.analysis.witnesses import resolved_content
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import loop_of, resolve
@@ -19,24 +18,14 @@ from noack.theory.witnesses.gains import find_by_gains
 from noack.theory.witnesses.outward import proven_bounds
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
-from noack_check.loop import Loop
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
 from tests.checker.completed import completed
+from tests.checker.loops import SERVO, loop_with, servo
 from tests.checker.proofs import Proved, proved
 from tests.checker.runs import floats
 from tests.helpers.bound_shares import share_of_bound
 from tests.helpers.shipped import resolved, shipped
-
-SERVO = "servo_reference"
-
-
-def servo(*settings: str) -> dict[str, Any]:
-    return dict(resolved_content(resolved(SERVO, *settings)))
-
-
-def loop_with(tables: dict[str, Any], *, box: bool = True, **times: fmpq) -> Loop:
-    return read_loop(tables, box=box, ideal=False, longer=times)
 
 
 @pytest.fixture(scope="module")

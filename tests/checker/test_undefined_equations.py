@@ -15,7 +15,7 @@ from noack.scenario.scenario_file import load
 from noack_check.check import RejectedError
 from noack_check.equations import enclose
 from noack_check.loop import Region
-from tests.checker.test_equations import Plant, unexplained
+from tests.checker.traced_plants import Plant, unexplained
 
 CASES = Path(__file__).parent.parent / "cases"
 WIDTHS = np.array([0.8, 0.6, 1.0])

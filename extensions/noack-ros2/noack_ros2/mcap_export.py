@@ -40,7 +40,7 @@ _SCHEMAS = json.loads(Path(__file__).with_name("mcap_schemas.json").read_bytes()
 """Schemas of the messages that are no rows of a table."""
 
 
-class Message(NamedTuple):
+class McapMessage(NamedTuple):
     """A message, with the arguments of the writer but its channel."""
 
     log_ns: int
@@ -101,12 +101,12 @@ def _write_content(writer: Writer, run: ExportedRun) -> None:
         _add(writer, channels[message.topic], message)
 
 
-def _in_order(streams: Iterable[Iterator[Message]]) -> Iterator[Message]:
+def _in_order(streams: Iterable[Iterator[McapMessage]]) -> Iterator[McapMessage]:
     """Yield the messages of several streams, each in the order of the log time, in this order."""
     return heapq.merge(*streams, key=lambda message: message.log_ns)
 
 
-def _add(writer: Writer, channel: int, message: Message) -> None:
+def _add(writer: Writer, channel: int, message: McapMessage) -> None:
     _, publish_ns, _, content, sequence = message
     writer.add_message(channel, message.log_ns, content, publish_ns, sequence)
 
@@ -125,7 +125,9 @@ def _register(
     return topic
 
 
-def _rows(run: ExportedRun, tables: list[str], channels: dict[str, int], writer: Writer) -> Iterator[Message]:
+def _rows(
+    run: ExportedRun, tables: list[str], channels: dict[str, int], writer: Writer
+) -> Iterator[McapMessage]:
     """Yield the rows of some tables in the order of their log time."""
     topics = {
         table: _register(writer, channels, run, _table_topic(table), _table_schema(table, run.tables[table]))
@@ -137,7 +139,7 @@ def _rows(run: ExportedRun, tables: list[str], channels: dict[str, int], writer:
         )
 
 
-def _rows_of_table(rows: Rows, topic: str, phase_ns: int) -> Iterator[Message]:
+def _rows_of_table(rows: Rows, topic: str, phase_ns: int) -> Iterator[McapMessage]:
     """Yield the rows of a table in the order of their log time; their times are those of the run."""
     names = rows.dtype.names or ()
     columns = {name: _column_reader(name, rows[name]) for name in names}
@@ -145,7 +147,7 @@ def _rows_of_table(rows: Rows, topic: str, phase_ns: int) -> Iterator[Message]:
         content = {name: column(i) for name, column in columns.items()}
         log_ns, publish_ns = (max(int(rows[name][i]) + phase_ns, 0) for name in ("now_ns", "t_ns"))
         sequence = int(rows["sequence"][i]) & _SEQUENCE_MASK
-        yield Message(log_ns, publish_ns, topic, to_json(content, inf_nan_mode="null"), sequence)
+        yield McapMessage(log_ns, publish_ns, topic, to_json(content, inf_nan_mode="null"), sequence)
 
 
 def _column_reader(name: str, column: Rows) -> Callable[[int], object]:
@@ -158,7 +160,7 @@ def _column_reader(name: str, column: Rows) -> Callable[[int], object]:
     return lambda i: column[i].tobytes().hex()
 
 
-def _log(run: ExportedRun, channels: dict[str, int], writer: Writer) -> Iterator[Message]:
+def _log(run: ExportedRun, channels: dict[str, int], writer: Writer) -> Iterator[McapMessage]:
     """Yield the lines of the run's log as foxglove.Log."""
     if not run.notices:
         return
@@ -172,7 +174,7 @@ def _log(run: ExportedRun, channels: dict[str, int], writer: Writer) -> Iterator
             "file": "",
             "line": 0,
         }
-        yield Message(t_ns, t_ns, topic, to_json(content), number)
+        yield McapMessage(t_ns, t_ns, topic, to_json(content), number)
 
 
 def _notices(run: ExportedRun) -> list[tuple[int, Mapping[str, Any]]]:
@@ -181,14 +183,14 @@ def _notices(run: ExportedRun) -> list[tuple[int, Mapping[str, Any]]]:
     return sorted(notices, key=lambda line: line[0])
 
 
-def _errors(run: ExportedRun, channels: dict[str, int], writer: Writer) -> Iterator[Message]:
+def _errors(run: ExportedRun, channels: dict[str, int], writer: Writer) -> Iterator[McapMessage]:
     """Yield the norms of the errors at each measurement."""
     topic = _register(writer, channels, run, ERRORS, _SCHEMAS["errors"])
     columns = run.samples().select(("t_ns", "e_s_norm", "threshold", "e_c_norm")).sort_by("t_ns").to_pydict()
     for number, values in enumerate(zip(*columns.values(), strict=True)):
         content = to_json(dict(zip(columns, values, strict=True)), inf_nan_mode="null")
         at_ns = max(values[0] + run.phase_ns, 0)  # damaged records have others
-        yield Message(at_ns, at_ns, topic, content, number & _SEQUENCE_MASK)
+        yield McapMessage(at_ns, at_ns, topic, content, number & _SEQUENCE_MASK)
 
 
 # Topics and schemas
@@ -253,7 +255,7 @@ class _Bag:
     def __init__(self, writer: Writer) -> None:
         self._writer, self._channels, self._schemas = writer, dict[str, int](), dict[str, int]()
 
-    def add(self, message: Message) -> None:
+    def add(self, message: McapMessage) -> None:
         """Write a message."""
         topic = message.topic
         if topic not in self._channels:
@@ -266,12 +268,12 @@ class _Bag:
         _add(self._writer, self._channels[topic], message)
 
 
-def _joint_states(run: ExportedRun, *, is_only: bool) -> Iterator[Message]:
+def _joint_states(run: ExportedRun, *, is_only: bool) -> Iterator[McapMessage]:
     """Yield the messages of a loop, in the order of the log time."""
     name = run.scenario.name
     prefix = ros2.namespace(run.name or name, is_only=is_only)
     for part in run.parts(*ros2.TOPICS):
-        messages: list[Message] = []
+        messages: list[McapMessage] = []
         for table in ros2.TOPICS:
             rows = part[table]
             for row, topic, entries in ros2.row_entries(table, rows, *run.names):
@@ -280,13 +282,13 @@ def _joint_states(run: ExportedRun, *, is_only: bool) -> Iterator[Message]:
                 number = int(rows["sequence"][row]) & _SEQUENCE_MASK
                 content = ros2.joint_state(message_entries, name)
                 publish_ns = max(message_entries.stamp_ns, 0)
-                messages.append(Message(log_ns, publish_ns, f"{prefix}/{topic}", content, number))
+                messages.append(McapMessage(log_ns, publish_ns, f"{prefix}/{topic}", content, number))
         yield from sorted(messages, key=lambda message: message.log_ns)
 
 
-def _rosout(run: ExportedRun) -> Iterator[Message]:
+def _rosout(run: ExportedRun) -> Iterator[McapMessage]:
     """Yield the lines of the run's log."""
     for number, (t_ns, notice) in enumerate(_notices(run)):
         level = _ROS_LEVELS.get(notice["level"], _ROS_INFO)
         line = ros2.log_line(t_ns, level, notice["process"], notice["text"])
-        yield Message(t_ns, t_ns, _ROSOUT, line, number)
+        yield McapMessage(t_ns, t_ns, _ROSOUT, line, number)
