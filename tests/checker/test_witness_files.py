@@ -16,6 +16,8 @@ from noack_check.scenario import read_loop
 from noack_check.sentences import assumptions, meaning
 from tests.helpers.resolved_tables import resolved_tables
 
+pytestmark = pytest.mark.xdist_group("witness files")
+
 CASES = Path(__file__).parent.parent / "cases"
 
 

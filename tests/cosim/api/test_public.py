@@ -87,7 +87,9 @@ EXAMPLES = sorted({*noack.__all__, *noack._NOT_IN_STAR} - WITHOUT_EXAMPLE)
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.live if name == "run" else ()) for name in EXAMPLES]
+)
 def test_the_examples_of_the_docstrings_run(name: str) -> None:
     (example,) = doctest.DocTestFinder(recurse=False).find(getattr(noack, name), name, module=False, globs={})
     outcome = doctest.DocTestRunner().run(example)
