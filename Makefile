@@ -122,7 +122,7 @@ define LEVEL
 endef
 
 test: setup-dev ## Run the tests: 5 minutes on two processors (ARGS are pytest's, e.g. ARGS="-k mansd")
-	$(if $(ARGS),$(PYTEST) $(ARGS),$(call LEVEL,not system and not deep))
+	$(if $(ARGS),$(PYTEST) -m "not system and not deep" $(ARGS),$(call LEVEL,not system and not deep))
 
 test-system: setup-dev ## Test what needs a browser, root or another build, and what the documentation shows: 4 minutes
 	$(if $(ARGS),$(PYTEST) -m system $(ARGS),$(call LEVEL,system and not deep))
