@@ -29,6 +29,7 @@ from noack.theory.witnesses.outward import proven_bounds
 from noack.theory.witnesses.regions import (
     PlantOnRegions,
     find_region_witness,
+    is_enclosed_everywhere,
     region_table,
     region_witness_by_gains,
 )
@@ -297,7 +298,8 @@ def known_or_found_on_region(
         if not most_work:
             return by_gains()
         by_forms = partial(find_region_witness, plant, outputs, ultimate=ultimate, near=near)
-        return forms_or_gains(partial(by_forms, progress=progress, most_work=most_work), by_gains)
+        by_forms = partial(by_forms, progress=progress, most_work=most_work)
+        return forms_or_gains(by_forms, by_gains) if is_enclosed_everywhere(plant) else by_forms()
 
     def loop_on(document: Mapping[str, object]) -> Loop:
         region = read_region(document, loop.n, loop.B.ncols())

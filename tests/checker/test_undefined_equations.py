@@ -7,8 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from cosim.analysis.witnesses import find_statement
+from cosim.cli.application import app
+from noack.core.errors import ExitStatus
 from noack.plants.systems.traced_equations import NotEnclosedError, trace
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
@@ -125,4 +128,14 @@ def test_a_region_does_not_reach_where_the_equations_are_undefined(case: str, na
     resolved = resolve(load(CASES / f"eq_{case}.toml", [f"plant.system.name={name}"]))
     statement = find_statement(resolved, "region", "ideal")
     assert statement.document is None
-    assert "not finite on the whole region" in statement.reason
+    assert statement.reason.count("not finite on the whole region") == 1
+
+
+def test_certify_names_what_is_undefined() -> None:
+    result = CliRunner().invoke(app, ["certify", str(CASES / "eq_ZeroLog.toml"), "--no-search"])
+    assert result.exit_code == ExitStatus.FAILED
+    text = " ".join(result.stdout.split())
+    assert (
+        "its equations are not finite on the whole region: log of a number that may be 0 or negative" in text
+    )
+    assert "proved" not in text

@@ -163,6 +163,15 @@ def _witness(
     return found._replace(document={**found.document, "equations": equations.document, "region": region})
 
 
+def is_enclosed_everywhere(plant: PlantOnRegions) -> bool:
+    """Return whether the equations have an enclosure for all x and u."""
+    try:
+        plant.on(np.full_like(plant.typical, np.inf))
+    except NotEnclosedError:
+        return False
+    return True
+
+
 def region_witness_by_gains(plant: PlantOnRegions, outputs: Sequence[str]) -> Witness:
     """Return a witness by gains of equations that are enclosed for all x and u, without a search.
 
