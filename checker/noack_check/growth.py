@@ -9,7 +9,8 @@ u the input that the plant applies, and the older x those of transmissions whose
 * a *burst* leads from this transmission to the next one whose update arrives, some units later. Whatever
   was lost between, it multiplies z by one matrix. This depends on the number of units, on the place of the
   first transmission relative to the controller's ticks, the *slot*, and, if updates expire, on how much
-  longer the update before it is used.
+  longer the update before it is used. An update that arrives within the latency of a live tick, before or
+  after it, acts at this tick or at the next one, whatever the updates before it did: each is a burst.
 * A *node* is all that bursts depend on after it: the state of the guarantee, the slot, and that time.
   Nodes with the same futures are one.
 
@@ -58,6 +59,8 @@ _MOST_PRODUCTS = 5000
 _LONGEST_PRODUCT = 40
 """Bursts of a product: balls become larger with each."""
 _MOST_SQUARINGS = 40
+LATENCY_NS = 200_000
+"""What arrives so near a tick may be before or after it in a live run, where it takes some 0.1 ms more."""
 _DEFINITE = arb(2) ** -100
 """A form is definite if it is positive with so much less."""
 
@@ -124,8 +127,42 @@ class Times(NamedTuple):
     def usable(self, units: int) -> int:
         """Return how much longer an update is used that was sent so long ago; up to the delay."""
         if self.timeout is None:
-            return self.rest
-        return min(max(self.timeout - units * self.unit, 0), self.rest)
+            return self.latest
+        return min(max(self.timeout - units * self.unit, 0), self.latest)
+
+    def arrivals(self, slot: int) -> list[int]:
+        """Return how long after a transmission an update may arrive: nominally, and beyond a tick near it.
+
+        An arrival at a tick is before it. Nothing arrives before it is sent.
+
+        Raises:
+            RefusedError: one of them is in the period before or after.
+        """
+        begin, near = slot * self.unit, LATENCY_NS * self.parts
+        arrival = begin + self.rest
+        before = (arrival - self.phase) // self.tick * self.tick + self.phase
+        found = [self.rest]
+        for tick in (before, before + self.tick):
+            other = (tick if tick < arrival else tick + 1) - begin
+            if abs(tick - arrival) > near or (other < 0 and self.behind == 0):
+                continue
+            if not 0 <= other <= self.unit:
+                raise RefusedError(
+                    "network.impairments.delay_s: not covered if an update arrives within "
+                    f"{LATENCY_NS / 1e6:g} ms of a transmission and of a tick; change controller.phase"
+                )
+            found.append(other)
+        return found
+
+    @property
+    def has_ties(self) -> bool:
+        """Whether an update may act at one of two ticks."""
+        return any(len(self.arrivals(slot)) > 1 for slot in range(self.slots))
+
+    @property
+    def latest(self) -> int:
+        """The longest time from a transmission to an arrival, without whole units."""
+        return max(max(self.arrivals(slot)) for slot in range(self.slots))
 
 
 class Burst(NamedTuple):
@@ -138,6 +175,8 @@ class Burst(NamedTuple):
     """How long the update before is used after the first transmission."""
     losses: int
     units: int
+    arrival: int | None = None
+    """How long after the first transmission an update arrives; None: nominally."""
 
 
 def list_bursts(guarantee: Guarantee, times: Times, between: range) -> list[Burst]:
@@ -156,7 +195,8 @@ def list_bursts(guarantee: Guarantee, times: Times, between: range) -> list[Burs
     first = guarantee.after(guarantee.start, lost=False)
     begin = first, 0, times.usable(1)
     numbers, pending = {begin: 0}, [begin]
-    bursts: dict[tuple[int, int, int], Burst] = {}
+    bursts: dict[tuple[int, int, int, int], Burst] = {}
+    arrivals = [times.arrivals(slot) for slot in range(times.slots)]
     while pending:
         node = state, slot, usable = pending.pop()
         source, sent = numbers[node], 0
@@ -168,8 +208,9 @@ def list_bursts(guarantee: Guarantee, times: Times, between: range) -> list[Burs
                 if target not in numbers:
                     numbers[target] = len(numbers)
                     pending.append(target)
-                burst = Burst(source, numbers[target], slot, usable, sent - 1, units)
-                bursts.setdefault((source, numbers[target], units), burst)
+                for arrival in arrivals[slot]:
+                    burst = Burst(source, numbers[target], slot, usable, sent - 1, units, arrival)
+                    bursts.setdefault((source, numbers[target], units, arrival), burst)
             if len(bursts) > MOST_BURSTS:
                 raise RefusedError(f"more than {MOST_BURSTS:,} transitions")
             state = guarantee.after(state, lost=True)
@@ -249,13 +290,13 @@ class PeriodicLoop:
             stack([x, x_c, u, K * x_c, *older]),
             stack([x, x_c, u, w if times.holds_input else 0 * w, *older]),
         )
-        delay_s = times.seconds(behind * times.unit + times.rest)
         sent = [x, *older]
-        self._arrived_x_c = (arb(delay_s) * H).exp() * sent[-1]
+        self._newest = sent[-1]
+        arrives_at_once = behind * times.unit + times.latest == 0
         self._loop = stack([x, x_c, u, w])
         self._sent = stack(sent[:-1]) if behind else None
         # A step comes before a transmission, so that u = w there. What arrives at once replaces x_c.
-        kept = [*range(n), *(range(n, 2 * n) if delay_s > 0 else ()), *range(2 * n, 2 * n + m)]
+        kept = [*range(n), *(() if arrives_at_once else range(n, 2 * n)), *range(2 * n, 2 * n + m)]
         kept += range(2 * (n + m), at[-1])
         self._kept, self.size = kept, len(kept)
         inputs = {2 * n + i: 2 * n + m + i for i in range(m)}
@@ -264,8 +305,8 @@ class PeriodicLoop:
         )
         self._flows: dict[int, arb_mat] = {}
         self._advances: dict[tuple[int, int, bool], arb_mat] = {}
-        self._after: dict[tuple[int, int], list[arb_mat]] = {}
-        self._matrices: dict[tuple[int, int, int], arb_mat] = {}
+        self._after: dict[tuple[int, int, int], list[arb_mat]] = {}
+        self._matrices: dict[tuple[int, int, int, int], arb_mat] = {}
 
     def under(self, guarantee: Guarantee) -> "PeriodicLoop":
         """Return the same loop with another guarantee."""
@@ -286,13 +327,14 @@ class PeriodicLoop:
 
     def matrix(self, burst: Burst) -> arb_mat:
         """Return the matrix of z over a burst."""
-        key = burst.slot, burst.usable, burst.units
+        arrival = self.times.rest if burst.arrival is None else burst.arrival
+        key = burst.slot, burst.usable, burst.units, arrival
         if key not in self._matrices:
             self._matrices[key] = self._over(*key)
         return self._matrices[key]
 
-    def _over(self, slot: int, usable: int, units: int) -> arb_mat:
-        states, T = self._after.setdefault((slot, usable), []), self.times
+    def _over(self, slot: int, usable: int, units: int, arrival: int) -> arb_mat:
+        states, T = self._after.setdefault((slot, usable, arrival), []), self.times
         begin = slot * T.unit
         expires = None if T.timeout is None else begin + T.timeout
         while len(states) < units:
@@ -300,18 +342,19 @@ class PeriodicLoop:
             if states:
                 state, step = states[-1], self._advance(now, now + T.unit, expires)
             else:
-                state, arrives = self._from_kept, now + T.rest
+                state, arrives = self._from_kept, now + arrival
                 before = self._advance(now, arrives, None if T.timeout is None else now + usable)
                 # What arrives was sent before, and what is under way does not change until the end.
-                step = self._advance(arrives, now + T.unit, expires) * self._arrived(before)
+                step = self._advance(arrives, now + T.unit, expires) * self._arrived(before, arrival)
             states.append(self._moved(step, state))
         return rows_of(states[units - 1], self._kept)
 
-    def _arrived(self, before: arb_mat) -> arb_mat:
+    def _arrived(self, before: arb_mat, arrival: int) -> arb_mat:
         """Return the matrix until after an arrival, of what was sent at the start or before it."""
         n = self.matrices[0].nrows()
         x, rest = (rows_of(before, rows) for rows in (range(n), range(2 * n, before.nrows())))
-        return stack([x, self._arrived_x_c, rest])
+        delay_s = self.times.seconds(self.times.behind * self.times.unit + arrival)
+        return stack([x, (arb(delay_s) * self.matrices[3]).exp() * self._newest, rest])
 
     def _moved(self, step: arb_mat, state: arb_mat) -> arb_mat:
         """Return the state after a unit, in which the newest x is under way, too."""
@@ -373,6 +416,8 @@ class Growth(NamedTuple):
     lower: arb | None
     """``pattern`` grows at least so fast; None: there is none."""
     pattern: str
+    has_ties: bool = False
+    """Whether an update may act at one of two ticks, anew each time."""
 
 
 def read_periodic_loop(resolved: Table, longest: int | None = None) -> PeriodicLoop:
@@ -439,8 +484,8 @@ def prove_growth(loop: PeriodicLoop, document: Mapping[str, object]) -> Growth:
         lower = lower**longest
     if upper is None and lower is None:
         raise RejectedError("growth: neither stable nor unstable")
-    shortest = loop.seconds(loop.between[0])
-    return Growth(loop.seconds(longest), shortest, loop.guarantee.losses, upper, lower, pattern)
+    shortest, has_ties = loop.seconds(loop.between[0]), loop.times.has_ties
+    return Growth(loop.seconds(longest), shortest, loop.guarantee.losses, upper, lower, pattern, has_ties)
 
 
 def _prove_upper(loop: PeriodicLoop, table: Mapping[str, object]) -> arb:
@@ -482,11 +527,18 @@ def _prove_lower(loop: PeriodicLoop, table: Mapping[str, object]) -> tuple[arb, 
     pattern, intervals = _pattern(loop, table)
     slots, slot, total = loop.times.slots, read_count(table, "slot", _MOST_SLOTS), sum(intervals)
     bursts = [*_bursts_of(pattern, intervals)]
+    places = table.get("arrivals", [0] * len(bursts))
+    if not isinstance(places, list) or len(places) != len(bursts):
+        raise RejectedError("unstable: arrivals: not one for each delivery")
     Π, units = identity(loop.size), 0
     for _ in range(slots // gcd(slots, total)):
         usable = loop.times.usable(bursts[-1])
-        for burst in bursts:
-            Π = loop.matrix(Burst(0, 0, (slot + units) % slots, usable, 0, burst)) * Π
+        for burst, place in zip(bursts, places, strict=True):
+            now = (slot + units) % slots
+            arrivals = loop.times.arrivals(now)
+            if type(place) is not int or not 0 <= place < len(arrivals):
+                raise RejectedError("unstable: arrivals: an update does not arrive then")
+            Π = loop.matrix(Burst(0, 0, now, usable, 0, burst, arrivals[place])) * Π
             usable, units = loop.times.usable(burst), units + burst
     if "coordinates" in table:
         T = read_rows(table, "coordinates")

@@ -136,14 +136,16 @@ def growth_sentences(growth: Growth) -> Iterator[str]:
     per = f"per period of {float(arb(growth.period).mid()):.6g} s, in the long run"
     if growth.upper is not None:
         end = ": stable" if growth.upper < 1 else ""
+        ties = ", at whichever of two ticks each update acts," if growth.has_ties else ""
         yield (
-            f"with at most {growth.losses} consecutive losses no pattern changes the loop's state by more "
-            f"than the factor {at_most(growth.upper)} {per}{end}"
+            f"with at most {growth.losses} consecutive losses no pattern{ties} changes the loop's state by "
+            f"more than the factor {at_most(growth.upper)} {per}{end}"
         )
     if growth.lower is not None:
         end = ": unstable" if growth.lower > 1 else ""
+        ties = ", each update at one of two ticks," if growth.has_ties else ""
         yield (
-            f"with {growth.losses} consecutive losses allowed, {growth.pattern}, repeated, changes the "
+            f"with {growth.losses} consecutive losses allowed, {growth.pattern}, repeated,{ties} changes the "
             f"loop's state at least by the factor {at_least(growth.lower)} {per}{end}"
         )
 

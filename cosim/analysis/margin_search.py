@@ -154,6 +154,12 @@ class LossCap(NamedTuple):
         trigger = f'{{policy="periodic", period_s={self.stability.intervals_s[0]!r}}}'
         return f"network.mansd={self.m - 1}", f"network.loss={script}", f"trigger={trigger}"
 
+    @property
+    def text(self) -> str:
+        """The result in words."""
+        bounds = f"growth per period {at_least(self.stability.lower)} to {at_most(self.stability.upper)}"
+        return f"at most {self.m - 1} lost in a row: {self.stability.verdict}, {bounds}"
+
 
 class PeriodLimit(NamedTuple):
     """Two periods between which all patterns of the scenario's guarantee cease to be stable."""
@@ -219,6 +225,8 @@ class MarginResult:
     """Factor of the limits of the work for a decision."""
     compared: GuaranteeComparison = _NOT_COMPARED
     """The scenario's guarantee and others, if there are others."""
+    ties: str = ""
+    """Which order of an update and a tick is not known, in words."""
     missing: tuple[str, ...] = ()
     """What was not examined, in words, because the search was stopped."""
 
@@ -268,7 +276,8 @@ class MarginResult:
         """Return the verdicts."""
         period = [self.period.text] if self.period else []
         proof = [] if self.proof is None else self.proof.lines
-        texts = [self.verdict, *proof, *self.compared.relations, *period, self.random_text]
+        ties = [self.ties] if self.ties else []
+        texts = [self.verdict, *ties, *proof, *self.compared.relations, *period, self.random_text]
         return "\n".join([*texts, *self.certificate_texts])
 
     @property
@@ -318,6 +327,7 @@ def find_margin(
     guarantees: Sequence[str] = (),
     effort: float = 1.0,
     progress: MarginProgress = lambda text: None,
+    decided: Callable[[LossCap], None] = lambda cap: None,
     on_stop: Callable[[StopRequestError], None] | None = None,
 ) -> MarginResult:
     """Find the margin of a scenario's loop.
@@ -330,6 +340,7 @@ def find_margin(
         guarantees: other guarantees to examine, in words such as ``mansd 4 atmost 3 in 10``.
         effort: factor of the limits of the work for a decision.
         progress: receives what is examined next.
+        decided: receives the result for each M, as soon as it is known.
         on_stop: receives the request to stop, after which the result has what was decided until then;
             without it, or before a result for M = 1, the request is raised.
 
@@ -360,6 +371,7 @@ def find_margin(
         # M = 1, 2, … up to the first one that is destabilised, or that the other rules imply.
         for m in range(1, most_m + 1):
             caps.append(LossCap(m, examine(capped(other_rules, m - 1), f"M = {m} of at most {most_m}")))
+            decided(caps[-1])
             every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
             if every_m or caps[-1].stability.verdict == "destabilised":
                 break
@@ -398,6 +410,7 @@ def find_margin(
         proof=proof,
         effort=effort,
         compared=compared,
+        ties=margin.ties,
         missing=tuple(f"M from {len(caps) + 1} on" if what == _CAPS else what for what in missing),
     )
 

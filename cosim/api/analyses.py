@@ -9,6 +9,7 @@ from cosim.analysis.mean_cost import MeanCost, find_mean_cost
 from cosim.api.scenarios import Source, load
 from cosim.live.monitoring.progress import work_bar
 from noack.core.progress import no_progress
+from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.resolution import resolve
 from noack.theory.witnesses.effort import MOST_WORK
 from noack.theory.witnesses.growth import ACCURACY
@@ -105,4 +106,5 @@ def cost(
         NoackError: the scenario is wrong, or its loop is not covered; the message names the
             setting.
     """
-    return find_mean_cost(resolve(load(scenario)), Q, R)
+    settled, _ = with_later_updates(load(scenario))
+    return find_mean_cost(resolve(settled), Q, R)

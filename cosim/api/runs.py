@@ -37,6 +37,7 @@ from cosim.simulation.virtual_time import simulate_run
 from cosim.studies.run_comparison import RunComparison, compare_runs
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import as_html, as_text
+from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -343,7 +344,7 @@ def simulate(scenario: Source, *, runs: PathLike | None = None) -> Run:
     Raises:
         NoackError: the scenario is wrong, or the run directory cannot be written.
     """
-    loaded = load(scenario)
+    loaded, _ = with_later_updates(load(scenario))
     with _folder(runs) as (folder, temporary):
         ending, view = simulate_run(loaded, folder), temporary is None
         simulated = Run(ending.run_dir, lambda: run_end.finalize(ending, report=False, view=view), temporary)

@@ -336,6 +336,7 @@ def margin(
             guarantees=guarantee or (),
             effort=effort,
             progress=lambda text: change(f"examining {text}"),
+            decided=lambda cap: print_to_stderr(f"noack: {cap.text}"),
         )
     show(margin_document(result), json=json, tables=tables)
     if witness is not None and result.proof is not None and result.proof.documents:
@@ -347,6 +348,8 @@ def margin(
         return ExitStatus.OK if result.stable_m else ExitStatus.FAILED
     if (pattern := result.destabilised) is None:
         raise CallerError(f"--play: no destabilising pattern was found for M up to {most}")
+    if result.ties:
+        raise CallerError(f"--play: no run can choose the ticks of the pattern: {result.ties}")
     from cosim.cli.execute_run import run_processes
     from cosim.cli.played_pattern import until_it_shows
 
@@ -388,9 +391,13 @@ def cost(
     from cosim.analysis.mean_cost import find_mean_cost
     from cosim.cli.cost_weights import given_weight
     from cosim.output.certificate_report import mean_cost_document
+    from noack.scenario.arrival_ties import with_later_updates
     from noack.scenario.resolution import resolve
 
-    resolved = resolve(opt.load_loop(scenario, settings, loop, network))
+    settled, tie = with_later_updates(opt.load_loop(scenario, settings, loop, network))
+    if tie:
+        print_to_stderr(f"noack: {tie}")
+    resolved = resolve(settled)
     costs = find_mean_cost(resolved, given_weight(Q), given_weight(R))
     show(mean_cost_document(costs), json=json, tables=tables)
     guaranteed = costs.with_guarantee

@@ -300,9 +300,14 @@ def unstable_document(loop: PeriodicLoop, path: Sequence[Burst]) -> tuple[Docume
     why, coordinates = "no pattern", _eigenvectors(loop, path)
     pattern = "".join("D" + "L" * burst.losses for burst in path)
     intervals = [units for burst in path for units in intervals_of(burst, loop.between)]
+    arrivals = [
+        0 if burst.arrival is None else loop.times.arrivals(burst.slot).index(burst.arrival) for burst in path
+    ]
     for squarings in _SQUARINGS if path else ():
         table = {"pattern": pattern, "slot": path[0].slot, "squarings": squarings}
         table |= {"coordinates": coordinates.tolist()} if coordinates is not None else {}
+        if any(arrivals):
+            table["arrivals"] = arrivals
         if len(loop.between) > 1:
             table["intervals"] = intervals
         document: Document = {"losses": loop.guarantee.losses, "unstable": table}

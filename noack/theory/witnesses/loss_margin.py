@@ -22,7 +22,7 @@ from noack.guarantee.loss_guarantee import (
 from noack.scenario.scenario import Scenario
 from noack.theory.time_triggered.scenario_times import intervals, loop_times, require_covered
 from noack.theory.witnesses.growth import ACCURACY, Document, GrowthBounds, enclose_growth, intervals_of
-from noack_check.growth import Guarantee, PeriodicLoop, read_periodic_loop
+from noack_check.growth import LATENCY_NS, Guarantee, PeriodicLoop, read_periodic_loop
 from noack_check.keys import RefusedError
 
 _COARSE_ACCURACY, _QUICK_ACCURACY = 1e-2, 3e-2
@@ -143,6 +143,16 @@ class LossMargin:
     def seconds(self, measurements: int) -> float:
         """Return the time of a number of measurements."""
         return self._measurement.times(measurements).seconds
+
+    @property
+    def ties(self) -> str:
+        """Which order of an update and a tick is not known, as a sentence; empty: there is none."""
+        if not self.loop.times.has_ties:
+            return ""
+        return (
+            f"an update arrives within {LATENCY_NS / 1e6:g} ms of a tick of the controller: it may act at "
+            "this tick or at the next one, and at each update both are covered"
+        )
 
     @property
     def delay_ns(self) -> Fraction:
