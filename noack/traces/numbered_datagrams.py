@@ -285,8 +285,8 @@ def _first_of_each(capture: Capture, numbered: NumberedPackets) -> NumberedPacke
                 "seems to have two counters, or no number there; filter the capture, or check --sequence-at"
             )
     first = np.sort(first)
-    columns = (column[first] for column in numbered[:4])
-    return NumberedPackets(*columns, *numbered[4:])
+    packet, part, received_ns, row = (column[first] for column in numbered[:4])
+    return numbered._replace(packet=packet, part=part, received_ns=received_ns, row=row)
 
 
 def _check_steps(capture: Capture, numbers: _Numbers, field: SequenceField) -> None:
