@@ -33,7 +33,7 @@ def place_poles(A: Matrix, B: Matrix, poles: NDArray[np.complex128]) -> Matrix:
     if inputs == 1 and most > 1:
         return _ackermann(A, B, poles)
     if most > inputs:
-        raise ValueError(f"none may occur more often than there are independent inputs ({inputs})")
+        raise ValueError(f"none may occur more than {inputs} times (independent inputs; observer: outputs)")
     return np.asarray(-placed(A, B, poles, maxiter=_MOST_ROUNDS, rtol=_CHANGE).gain_matrix, np.float64)
 
 
