@@ -314,7 +314,8 @@ def margin(
     --play takes the scenario's horizon, or a longer one, up to 10 minutes, at which the growth of
     ‖x‖ shows, and prints what to expect.
 
-    Takes some seconds; minutes where the times of events vary, as with a deadline.
+    Takes a second to ten for each M, and as long again for the period; minutes where the times of events
+    vary, as with a deadline. Each result is printed when it is known.
     """
     from cosim.analysis.margin_search import find_margin
     from cosim.output.certificate_report import margin_document
