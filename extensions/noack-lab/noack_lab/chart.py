@@ -17,9 +17,12 @@ _CROSS = "path://M0 1L1 0L5 4L9 0L10 1L6 5L10 9L9 10L5 6L1 10L0 9L4 5Z"
 _PIXELS_PER_POINT = 4 / 3
 _DECADES = 7
 """Below the largest value on a logarithmic axis: an error is 0 after a reset."""
-_HEAD, _PLOT, _GAP, _FOOT = 48, 120, 12, 40
-"""Heights in pixels: title and legend of a panel, its axes, the space below them, the last axis."""
-_LEFT, _RIGHT, _TOOLS = 62, 14, 84
+_TITLE, _LINE, _PLOT, _GAP, _FOOT = 24, 22, 120, 30, 46
+"""Heights in pixels: the title of a panel, a line of its legend, its axes, the times below them, the
+last axis with its name."""
+_LEFT, _RIGHT = 62, 14
+_LEGEND, _CHARACTER, _KEY = 300, 7.5, 50
+"""Widths in pixels: the legend on a phone, a character of it, the sample and the gap of an entry."""
 
 
 class Drawn(NamedTuple):
@@ -34,7 +37,18 @@ class Drawn(NamedTuple):
 
 def height_px(options: Json) -> int:
     """Return the height of a chart."""
-    return len(options["grid"]) * (_HEAD + _PLOT + _GAP) + _FOOT
+    return int(options["grid"][-1]["top"]) + _PLOT + _FOOT if options["grid"] else _FOOT
+
+
+def _legend_lines(names: Sequence[str]) -> int:
+    """Return how many lines a legend has on a phone, where it wraps."""
+    lines, used = 1, 0.0
+    for name in names:
+        width = _KEY + _CHARACTER * len(name)
+        if used and used + width > _LEGEND:
+            lines, used = lines + 1, 0.0
+        used += width
+    return lines
 
 
 def chart_options(drawn: Drawn) -> Json:
@@ -59,9 +73,10 @@ def chart_options(drawn: Drawn) -> Json:
         },
         "title": [], "legend": [], "grid": [], "xAxis": [], "yAxis": [], "series": [],
     }  # fmt: skip
+    top = 0
     for number, (panel, curves) in enumerate(panels.items()):
         title = panel_title(panel, drawn.run.curves)
-        top, is_last = number * (_HEAD + _PLOT + _GAP), number == len(panels) - 1
+        is_last = number == len(panels) - 1
         unit = next((f" [{curve.unit}]" for curve in curves if curve.unit), "")
         scale = " (logarithmic)" if curves[0].is_logarithmic else ""
         style = {"fontSize": 14, "fontWeight": 600}
@@ -69,12 +84,13 @@ def chart_options(drawn: Drawn) -> Json:
             {"text": f"{title}{unit}{scale}", "top": top + 2, "left": 4, "textStyle": style}
         )
         names = list(dict.fromkeys(curve.name for curve in curves))
-        legend: Json = {"data": names, "top": top + 24, "left": _LEFT - 6, "type": "scroll"}
-        legend["right"] = _RIGHT if number else _TOOLS
+        legend: Json = {"data": names, "top": top + _TITLE, "left": _LEFT - 6, "right": _RIGHT}
         options["legend"].append(legend | {"itemGap": 14, "textStyle": {"fontSize": 13}})
-        options["grid"].append({"top": top + _HEAD, "height": _PLOT, "left": _LEFT, "right": _RIGHT})
+        top += _TITLE + _LINE * _legend_lines(names) + 2
+        options["grid"].append({"top": top, "height": _PLOT, "left": _LEFT, "right": _RIGHT})
+        top += _PLOT + _GAP
         axis: Json = {"type": "value", "gridIndex": number, "min": 0, "max": float(f"{end_s:.6g}")}
-        axis |= {"axisLabel": {"show": is_last, "fontSize": 13}, "splitLine": {"show": False}}
+        axis |= {"axisLabel": {"fontSize": 13}, "splitLine": {"show": False}}
         axis["axisLine"] = {"onZero": False}
         if is_last:
             axis |= {"name": "time t [s]", "nameLocation": "middle", "nameGap": 24}

@@ -45,6 +45,8 @@ class LiveRun:
         """Reports of the progress."""
         self.lines: list[str] = []
         """What happened, the newest line last."""
+        self.norm_at_start: float | None = None
+        """‖x‖ at t = 0; None if the scenario draws it, or has several loops."""
         self.version = 0
         """Grows with each change."""
         self._process: asyncio.subprocess.Process | None = None
@@ -61,15 +63,18 @@ class LiveRun:
 
     @property
     def shown(self) -> ShownRun:
-        """What is known so far: ‖x‖ and the counts of transmissions over time."""
+        """What is known so far: ‖x‖ and the counts of transmissions over time, from t = 0 on."""
+        start = {"t_s": 0.0, "x_norm": self.norm_at_start, "events": 0, "deliveries": 0}
+        reports = [start, *self.reports] if self.reports else []
         t_s, norm, sent, received = (
-            np.array([report[key] if report[key] is not None else np.nan for report in self.reports])
+            np.array([report[key] if report[key] is not None else np.nan for report in reports])
             for key in ("t_s", "x_norm", "events", "deliveries")
         )
         curves = [
             noack.Curve(NORM, "‖x‖ plant", "", t_s, norm, noack.CurveStyle(_GREY, 2.4)),
-            noack.Curve(COUNTS, "sent", "", t_s, sent, noack.CurveStyle(_BLUE, is_held=True)),
-            noack.Curve(COUNTS, "received", "", t_s, received, noack.CurveStyle(_ORANGE, is_held=True)),
+            # Wider than the curve that is drawn over it: both are visible where they coincide.
+            noack.Curve(COUNTS, "sent", "", t_s, sent, noack.CurveStyle(_BLUE, 4.0, is_held=True)),
+            noack.Curve(COUNTS, "received", "", t_s, received, noack.CurveStyle(_ORANGE, 1.6, is_held=True)),
         ]
         return ShownRun(LIVE, curves, self._verdict())
 
@@ -91,6 +96,9 @@ class LiveRun:
 
         Its file is in a folder of this user, where no other can replace it.
         """
+        x0 = scenario.plant.initial_state if scenario.loops is None else None
+        if x0 is not None and scenario.plant.initial_state_halfwidth is None:
+            self.norm_at_start = float(np.linalg.norm(x0))
         with tempfile.TemporaryDirectory(prefix="noack-lab-") as folder:
             path = Path(folder) / f"{scenario.name}.toml"
             path.write_text(tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True)), "utf-8")

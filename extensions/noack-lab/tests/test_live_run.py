@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import noack
+from noack_lab.chart import Drawn, chart_options, height_px
 from noack_lab.live_run import LiveRun
 
 PROGRESS = {
@@ -32,11 +33,30 @@ def test_what_a_live_run_prints_sets_its_state_and_its_lines() -> None:
     assert (run.state, run.share) == ("running", 0.5)
     shown = run.shown
     assert shown.values("‖x‖ plant").tolist() == [0.5]
+    assert {float(curve.t_s[0]) for curve in shown.curves} == {0.0}
+    run.norm_at_start = 3.0
+    assert run.shown.values("‖x‖ plant").tolist() == [3.0, 0.5]
     assert shown.verdict[0].text == "running: 2.0 of 4 s"
     assert shown.verdict[1].text == "longest loss burst 2, largest lateness 0.25 ms"
     take(run, "end", directory="runs/a", status=0)
     assert run.is_over
     assert run.lines == ["it is run", "it is end"]
+
+
+def test_each_panel_of_the_chart_has_the_time_and_room_for_its_legend() -> None:
+    """On a phone the legend wraps; a page shows the first panels without scrolling."""
+    run = LiveRun(4.0)
+    take(run, "progress", **PROGRESS)
+    options = chart_options(Drawn(run.shown, ""))
+    assert all(axis["axisLabel"].get("show", True) and axis["min"] == 0 for axis in options["xAxis"])
+    assert {legend.get("type", "plain") for legend in options["legend"]} == {"plain"}
+    for legend, grid in zip(options["legend"], options["grid"], strict=True):
+        widths = [50 + 7.5 * len(name) for name in legend["data"]]
+        lines = sum(widths) / 300
+        assert grid["top"] - legend["top"] >= 22 * lines
+    assert height_px(options) > options["grid"][-1]["top"] + options["grid"][-1]["height"]
+    sent, received = (run.shown.curves[i].style.width for i in (1, 2))
+    assert sent > 2 * received  # both are visible where they coincide
 
 
 @pytest.mark.parametrize("line", ["compiling ...", "{", "[1]", '{"x": 1}', "7"])
