@@ -203,6 +203,8 @@ SEARCHES: dict[str, OfLoop | OfScenario] = {
     "claims_box": OfScenario("double_integrator", (), "box"),
     "claims_box_late": OfScenario("double_integrator", (), "box", longer=LATE),
     "claims_belt": OfScenario("dc_motor_load", BELT),
+    "pendulum": OfScenario("unstable_pendulum", ()),
+    "pendulum_ideal": OfScenario("unstable_pendulum", (), conditions="ideal"),
     "filtered_mass": OfScenario("double_integrator", FILTERED_MASS, "own", "schedule"),
     "dc_motor_load": OfScenario("dc_motor_load", (), "own", "schedule"),
     "servo_reference": OfScenario("servo_reference", (), "box", "schedule"),

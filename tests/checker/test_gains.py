@@ -429,7 +429,7 @@ def test_bounds_of_random_loops_are_not_exceeded(kind: str, count: int) -> None:
             continue
         found += 1
         step = loop.times.sampling if loop.times.sampling > 0 else loop.times.period / 5
-        assert exceeded(loop, proof, rng, 200 * float(arb(step)), by_forms=False) == []
+        assert exceeded(loop, proof, rng, 100 * float(arb(step)), by_forms=False) == []
 
 
 def least_sizes(loop: Loop) -> dict[str, float]:

@@ -28,7 +28,7 @@ from tests.helpers.shipped import shipped
 pytestmark = pytest.mark.usefixtures("nothing_was_found_before")
 
 PERIODIC = "trigger={policy='periodic', period_s=0.1}"
-LONGEST = 7
+LONGEST = 6
 """Of the patterns that are played."""
 
 

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 Tables = dict[str, Any]
 Rng = np.random.Generator
 SETTINGS = ("plant.measure_every=10", "observer.initial_estimate=[0.25,0.05]")
-_TESTS, _SECONDS = 250, 1.5
+_TESTS, _SECONDS = 150, 1.5
 """So many measurements of the worst error, and the time of a random run."""
 _ROUNDING, _NEAR = 1e-9, 0.8
 
