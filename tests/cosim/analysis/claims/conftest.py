@@ -59,7 +59,7 @@ def make() -> Make:
             "controller": {"rate_hz": 100.0},
             "trigger": {"beta": 0.02, "alpha_per_s": 0.25},
             "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}},
-            "certificate": {"late_periods": 0},
+            "certificate": {"late_periods": 0, "paper": True},
         }  # fmt: skip
         for section, values in changes.items():
             inner = isinstance(values, dict)
