@@ -26,7 +26,7 @@ from noack.plants.plant_settings import (
     SystemFailedError,
     name_and_unit,
 )
-from noack.settings.section import require_distinct
+from noack.settings.section import require_distinct, require_name
 from noack.settings.user_files import ClassSettings, UserCode, new_instance, read_only, real_vector, user_code
 
 _PLACE = "plant.system"
@@ -88,7 +88,10 @@ def _texts(name: str, values: object) -> tuple[str, ...]:
     texts = tuple(values)
     if not texts or not all(isinstance(text, str) and text for text in texts):
         raise ValueError(f'{name} is {values!r}; give a list of names, e.g. ["angle, rad"]')
-    require_distinct(tuple(name_and_unit(text)[0] for text in texts), name)
+    plain_names = tuple(name_and_unit(text)[0] for text in texts)
+    for plain_name in plain_names:
+        require_name(plain_name)
+    require_distinct(plain_names, name)
     return texts
 
 

@@ -5,13 +5,10 @@ its deviation is c (x - x_r).
 """
 
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
-from pydantic import Field
+from noack.settings.section import Name, Positive, Row, ScenarioSection, Unit, require_length
 
-from noack.settings.section import Positive, Row, ScenarioSection, Unit, require_length
-
-_LONGEST_NAME = 64
 DISTANCE = "output "
 """What the name of an output's distance begins with."""
 
@@ -19,7 +16,7 @@ DISTANCE = "output "
 class OutputSection(ScenarioSection):
     """An output of the loop: a quantity that its user wants to know."""
 
-    name: Annotated[str, Field(min_length=1, max_length=_LONGEST_NAME)]
+    name: Name
     """The output's name."""
     unit: Unit = ""
     """Its unit, e.g. "rad"; by default that of the state, if it is one."""
@@ -78,8 +75,6 @@ def loop_outputs(
         key = f"outputs.{index}"
         if section.name in [output.name for output in found]:
             raise ValueError(f"{key}.name: {section.name} is the name of another output, too")
-        if not section.name.isprintable() or not section.unit.isprintable():
-            raise ValueError(f"{key}.name: name and unit must be printable, on one line")
         row = _row_of(section, f"{key}.row", state_names)
         unit = section.unit or next((units[i] for i in range(n) if row == _unit_row(i, n)), "")
         found.append(LoopOutput(section.name, unit, row, section.allowed))

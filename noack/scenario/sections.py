@@ -39,6 +39,7 @@ from noack.settings.section import (
     HalfWidthRows,
     HalfWidths,
     MatrixRows,
+    Name,
     NonNegative,
     RateHz,
     Row,
@@ -100,13 +101,13 @@ class ModelSection(ScenarioSection):
     matrices."""
     names: dict[Literal["A", "B", "gain"], str] | None = None
     """Names of the arrays in the file, if they differ from A, B and gain."""
-    state_names: tuple[str, ...] | None = None
+    state_names: tuple[Name, ...] | None = None
     """Names of the n states, for outputs, tables and plots; by default those of a named model or of the
     plant's kind, if it has names."""
     state_units: tuple[Unit, ...] | None = None
     """Units of the n states, e.g. ["rad", "rad/s"]; "" for one without a unit. By default those of a
     named model or of the plant's kind."""
-    input_names: tuple[str, ...] | None = None
+    input_names: tuple[Name, ...] | None = None
     """Names of the m inputs, for plots."""
     load: Literal["input"] | MatrixRows | None = None
     """Unknown constant loads, which the sensor's observer estimates and the input compensates.

@@ -40,7 +40,25 @@ Table = dict[str, object]
 ReadTable = Mapping[str, object]
 """The same, where it is only read."""
 Positive = Annotated[FiniteFloat, Field(gt=0)]
-Unit = Annotated[str, Field(max_length=24)]
+
+_LONGEST_NAME = 64
+
+
+def require_name(text: str) -> str:
+    """Return the name of an output, a state or an input, or its unit.
+
+    Raise ValueError unless it can stand in a line of text and in the legend of a figure, which reads
+    text between two $ as a formula.
+    """
+    if len(text) > _LONGEST_NAME or not text.isprintable() or text.strip() != text or "$" in text:
+        raise ValueError(
+            f"names have at most {_LONGEST_NAME} printable characters, no $, and no space at an end"
+        )
+    return text
+
+
+Name = Annotated[str, Field(min_length=1, max_length=_LONGEST_NAME), AfterValidator(require_name)]
+Unit = Annotated[str, Field(max_length=24), AfterValidator(require_name)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Correlation = Annotated[FiniteFloat, Field(ge=0, lt=1)]

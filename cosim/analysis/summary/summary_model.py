@@ -25,11 +25,9 @@ def _or_none(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-Text = Annotated[str, Field(pattern=r"^[^\[]*$")]
-"""Text without an opening bracket, which would start markup in a printed table."""
 Count = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 Real = Annotated[float | None, BeforeValidator(_or_none)]
-Counts = dict[Text, Count]
+Counts = dict[str, Count]
 Matrix = Annotated[list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1)]
 
 
@@ -52,8 +50,8 @@ class ViolationPart(SummaryPart):
     """An assumption that the run violated, first at ``t_s``."""
 
     t_s: float
-    process: Text
-    cause: Text
+    process: str
+    cause: str
     what: str
     """The largest excess."""
     worst_at_s: float | None = None
@@ -94,7 +92,7 @@ class FlowPart(SummaryPart):
 class WatchdogPart(SummaryPart):
     """The number of times that the plant's watchdog acted."""
 
-    policy: Text
+    policy: str
     timeout_s: float
     trips: Count
     first_s: Real
@@ -104,7 +102,7 @@ class WatchdogPart(SummaryPart):
 class EstimationPart(SummaryPart):
     """The sensor's estimation error."""
 
-    observer: Text | None
+    observer: str | None
     outputs: Count
     noise_std: list[float]
     rms: Real
@@ -117,8 +115,8 @@ class EstimationPart(SummaryPart):
 class DisturbancePart(SummaryPart):
     """The disturbances at one place."""
 
-    at: Text
-    kinds: list[Text]
+    at: str
+    kinds: list[str]
     rms: Real
     max: Real
 
@@ -130,10 +128,10 @@ class ReplayDifference(SummaryPart):
     not finite has this form only.
     """
 
-    table: Text
+    table: str
     row: Count
     """Index in the table, from 0."""
-    column: Text
+    column: str
     """Name as in the Parquet file, such as ``x_2``; empty if no single column differs."""
     recorded: Count | float | str | None
     recorded_hex: str | None
@@ -254,7 +252,7 @@ class Claim(SummaryPart):
     proved: bool | None = None
     """Whether the checker has proven the bound, as that of a certificate. None: it follows from the
     definitions of the loop, or there is no bound."""
-    output: Text | None = None
+    output: str | None = None
     """The output that is bounded, by its name; None: something else is."""
 
     @property
@@ -326,7 +324,7 @@ class ChangePart(SummaryPart):
     t_s: float
     settings: dict[str, object]
     what: str
-    in_force_from_s: dict[Text, float]
+    in_force_from_s: dict[str, float]
 
 
 class ExitPart(SummaryPart):
@@ -339,7 +337,7 @@ class ExitPart(SummaryPart):
 class OutputPart(SummaryPart):
     """An output that the scenario states: its distance from its set-point or reference during the run."""
 
-    name: Text
+    name: str
     unit: str
     allowed: Real
     """The allowed error; None: nothing is asked."""
@@ -356,7 +354,7 @@ class OutputPart(SummaryPart):
 class LoopSummary(SummaryPart):
     """A loop of the run; times are its own, which are 0 at its phase."""
 
-    name: Text
+    name: str
     number: Count
     phase_s: float
     """Time of the run at which the loop begins."""
@@ -380,14 +378,14 @@ class LoopSummary(SummaryPart):
     """Only if they cross the network."""
     assumption_violations: list[ViolationPart]
     assumptions: list[AssumptionPart]
-    uneven_periods: list[Text] = []
+    uneven_periods: list[str] = []
     """What differs from the scenario's periods since they do not divide each other."""
     changes: list[ChangePart]
     missing_samples: Count
     missing_by_table: Counts
     unintended_losses: Count
     unintended_losses_by_leg: Counts
-    rejected_datagrams: dict[Text, Counts]
+    rejected_datagrams: dict[str, Counts]
     inter_event_min_s: Real
     inter_event_median_s: Real
     inter_delivery_median_s: Real
@@ -402,9 +400,9 @@ class LoopSummary(SummaryPart):
     sup_e_c_at_s: Real
     identity_residual_max: Real
     identity_residual_relative: Real
-    lateness_us: dict[Text, LatenessPart]
+    lateness_us: dict[str, LatenessPart]
     latency_us: LatencyPart | None
-    realtime: dict[Text, dict[Text, str]]
+    realtime: dict[str, dict[str, str]]
     watchdog: WatchdogPart
     estimation: EstimationPart | None
     disturbances: list[DisturbancePart]
@@ -479,7 +477,7 @@ class RunSummary(SummaryPart):
 
     kind: Literal["live", "simulated"]
     startup_s: Real
-    scenario: Text
+    scenario: str
     mansd: Count
     constraints: list[str] = []
     """Further constraints of the guarantee, in the words of the settings."""
@@ -491,7 +489,7 @@ class RunSummary(SummaryPart):
     """In the order of their numbers."""
     changes: list[ChangePart]
     """The changes of settings during the run, in the time of the run."""
-    deadlines: dict[Text, DeadlinesPart] = Field(default_factory=dict)
+    deadlines: dict[str, DeadlinesPart] = Field(default_factory=dict)
     """By process; empty for a simulated run."""
     exit: ExitPart
 
