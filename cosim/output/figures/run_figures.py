@@ -72,6 +72,8 @@ Flags = NDArray[np.bool_]
 Envelope = tuple[str, Quantity, Reals, Reals, BoundKind]
 """A bound: label, bounded quantity, times in s (k,), values (k,), source."""
 
+_FAR = 20.0
+"""A bound this many times above everything else in a picture does not set its scale."""
 BOUNDED = ("outputs", "errors", "state-norm", "inter-event")
 """The figures that show certified bounds."""
 _STATES_NARROWEST_IN, _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN = 1.7, 2.2, 5.0
@@ -353,18 +355,41 @@ def _output_curves(record: RunRecord, output: LoopOutput) -> list[Curve]:
     return output_curves(output, t_s, distance)
 
 
+def _lowest(bound: Curve) -> float:
+    """Return the smallest value of a bound; 0 if it has none."""
+    known = bound.values[np.isfinite(bound.values)]
+    return float(known.min()) if len(known) else 0.0
+
+
 def _outputs(record: RunRecord, bounds: Mapping[str, list[Curve]]) -> PageFigure:
     outputs = _stated_outputs(record)[:_MOST_OUTPUTS]
     target = record.scenario.controller.target or "0, as its set-point is not known"
     drawn = {output: _output_curves(record, output) for output in outputs}
+    highest = {
+        output: max((float(curve.values.max(initial=0.0)) for curve in curves), default=0.0)
+        for output, curves in drawn.items()
+    }
+    near = {
+        output: [bound for bound in bounds[output.name] if _lowest(bound) <= _FAR * highest[output]]
+        for output in outputs
+    }
 
     def draw(figure: "Figure") -> list[Panels]:
         panels = []
         for i, (output, curves) in enumerate(drawn.items()):
             axes = figure.add_axes((0, 0, 1, 1))
             title = f"{label_text(output.name)}: distance from its {target}"
-            draw_norms(axes, title, curves, bounds[output.name])
+            far = [
+                _lowest(bound)
+                for bound in bounds[output.name]
+                if all(bound is not each for each in near[output])
+            ]
+            if far:
+                title += f" (bound {label_text(output.quantity(f'{min(far):.3g}'))} or more, not drawn)"
+            draw_norms(axes, title, curves, near[output])
             low, high = axes.get_ylim()
+            if 0 < _FAR * highest[output] < high:
+                axes.set_ylim(top=_FAR * highest[output])
             values = curves[0].values
             if output.allowed is not None:  # what is far within is of no interest, unless all is
                 low = _LEAST_SHOWN * min(output.allowed, values.max(initial=0.0))
@@ -384,7 +409,7 @@ def _outputs(record: RunRecord, bounds: Mapping[str, list[Curve]]) -> PageFigure
         name="outputs",
         draw_panels=draw,
         caption=f"What the scenario asks of the loop: how far each output is from its {target}.{allowed}"
-        + _dashed([bound for each in bounds.values() for bound in each]),
+        + _dashed([bound for each in near.values() for bound in each]),
         description="Distances over time on a logarithmic axis: "
         + ", ".join(
             f"{output.name} up to {output.quantity(largest_text(curves[0].values))}"
