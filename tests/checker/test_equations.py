@@ -260,6 +260,6 @@ def test_no_attack_exceeds_what_is_proven_on_a_region() -> None:
     step_s = float(arb(statement.loop.times.sampling))
     sizes = largest_sizes(statement.loop, pendulum, step_s=step_s, steps=600, runs=100)
     worst = largest_shares(sizes, statement.bounds, step_s)
-    assert {"x[0]", "u[0]"} <= worst.keys()
+    assert "x[0]" in worst  # of which the region has a limit
     assert max(worst.values()) < 1, worst
     assert min(worst[signal] for signal in ("x", "e_s", "e_c")) > 0.1
