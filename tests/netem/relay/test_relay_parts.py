@@ -146,6 +146,7 @@ def test_the_relay_reuses_memory_of_datagrams_and_clients_that_left(
             assert relay._directions[0].rows == 16
 
 
+@pytest.mark.live
 def test_datagrams_that_arrived_while_the_relay_was_stopped_come_before_housekeeping() -> None:
     """It is stopped for 60 ms while it waits for a pause, in which to do housekeeping that is due."""
     with (
