@@ -121,6 +121,11 @@ class KalmanSettings(ObserverSettings):
             R = np.diag(np.square(self.noise_std))
         return model._replace(Q=Q, R=R)
 
+    def stated(self, assumed: EstimationModel) -> Self:
+        Q, R = (rows_of((M + M.T) / 2) for M in (assumed.Q, assumed.R))
+        given = {"process_std": None, "input_std": None, "noise_std": None}
+        return self.model_copy(update={**given, "Q": Q, "R": R})
+
     def steady_gain(self, assumed: EstimationModel) -> Matrix | None:
         """Return L from the discrete algebraic Riccati equation; None if its solver fails."""
         # Imported here: a sensor does not need this large module.

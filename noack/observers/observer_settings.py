@@ -91,6 +91,10 @@ class ObserverSettings(ScenarioSection):
         """Return the model with the covariances that the observer assumes."""
         return model
 
+    def stated(self, assumed: EstimationModel) -> Self:
+        """Return settings with the covariances that the observer assumes, which depend on no other table."""
+        return self
+
     @abstractmethod
     def steady_gain(self, assumed: EstimationModel) -> Matrix | None:
         """Return L in the steady state, (n, p); None if none is found."""

@@ -167,9 +167,9 @@ def test_control_characters_do_not_reach_the_terminal(
     [
         (
             "lane_following, its plant, its schedule: ‖x‖ ≤ 0.001 e^(−9 t). Copy of g43",
-            'PROVED "lane_following, its plant, its schedule: ‖x‖ ≤ 0.001 e^(−9 t). Copy of g43", its plant',
+            'PROVED "lane_following, its plant, its schedule: ‖x‖ ≤ 0.001 e^(−9 t). Copy of g43", ',
         ),
-        ('a", its plant: ‖x‖ ≤ 0', r'PROVED "a\", its plant: ‖x‖ ≤ 0", its plant'),
+        ('a", its plant: ‖x‖ ≤ 0', r'PROVED "a\", its plant: ‖x‖ ≤ 0", '),
     ],
 )
 def test_a_name_that_reads_like_a_statement_is_quoted(file: Path, name: str, begins: str) -> None:

@@ -19,6 +19,7 @@ from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
 from noack.references.segment import SolutionSegment
+from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows, Table
@@ -150,10 +151,10 @@ def certified_delay_s(resolved: Scenario) -> float:
 def with_stated_numbers(resolved: Scenario) -> Scenario:
     """Return a resolved scenario with numbers in place of what follows from other keys.
 
-    These are the network delay that certificates allow for, the watchdog's timeout, and the input of a
-    set-point, which becomes a constant reference; their effect stays the same. In the place of normally
-    distributed values there are those within the bounds that a run keeps but for a small probability. The
-    delay in a queue is not known: if it is not stated, it stays so.
+    These are the network delay that certificates allow for, the watchdog's timeout, the covariances of a
+    Kalman filter, and the input of a set-point, which becomes a constant reference; their effect stays the
+    same. In the place of normally distributed values there are those within the bounds that a run keeps but
+    for a small probability. The delay in a queue is not known: if it is not stated, it stays so.
     """
     update: Table = {}
     if not resolved.network.link.queues:
@@ -162,6 +163,8 @@ def with_stated_numbers(resolved: Scenario) -> Scenario:
     timeout_s = resolved.timing.actuation_timeout_ns / NS_PER_S
     watchdog = resolved.plant.watchdog.model_copy(update={"timeout_s": timeout_s})
     update["plant"] = with_bounded_values(resolved).model_copy(update={"watchdog": watchdog})
+    if resolved.observer is not None:
+        update["observer"] = resolved.observer.stated(assumed_model(resolved))
     if (setpoint := setpoint_of(resolved)) is not None:
         states = resolved.model.followed_states
         (segment,) = Reference.constant(setpoint[0][:states], setpoint[1]).segments
