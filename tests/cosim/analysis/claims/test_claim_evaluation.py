@@ -252,7 +252,8 @@ def test_a_state_that_decays_to_the_smallest_numbers_violates_no_claim() -> None
 
 def test_too_many_dropouts_void_the_papers_theorems(make: Make) -> None:
     """The theorems assume M − 1; consequences of (I1) alone do not and are judged to the end."""
-    record = simulate(make(network={"loss": {"model": "worst_case"}, "enforce_mansd": False, "mansd": 2}))
+    network = {"loss": {"model": "worst_case"}, "enforce_mansd": False, "mansd": 2}
+    record = simulate(make(network=network, certificate={"paper": True}))
     claims = RunClaims(record).evaluate()
     since = {claim.since_s for claim in claims if claim.verdict is VOID}
     theorems = [claim for claim in claims if claim.source.startswith("Theorem")]
