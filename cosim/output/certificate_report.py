@@ -21,7 +21,7 @@ from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most, duration_at_least, number
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.assumptions import AssumptionStatus, paper_assumptions
+from noack.theory.certificates.assumptions import AssumptionStatus, other_sign, paper_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import EQUATIONS, outside_box
 from noack.theory.witnesses.loss_margin import Stability
@@ -164,6 +164,8 @@ def _doubt(lead: str, text: str) -> Sentence:
 def _advice(results: Certificates) -> Sentence:
     """Return that there is no certificate, and settings with which there is one."""
     parts = [f"so no bound of ‖x‖{', though the loop is stable' if _is_stable(results) else ''}"]
+    if hint := other_sign(loop_of(results.scenario)):
+        parts.append(hint)
     if not results.is_searched:
         parts.append("a search, noack certify without --no-search, may find one if none has failed yet")
     if settings := _listed("there is one", results.helpful_settings):

@@ -120,7 +120,7 @@ def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
         f'it is of kind "{resolved.plant.system.kind}": {_NOT_BY_THEOREMS}; a certificate may cover '
         "its equations"
     )
-    why = f"largest real part of an eigenvalue: {nominal:.3g} /s (Â + B̂K){_other_sign(loop)}"
+    why = f"largest real part of an eigenvalue: {nominal:.3g} /s (Â + B̂K){_with_other_sign(loop)}"
     return [
         _violated(LINEAR_PLANT, "eq:plant", kind),
         _checked("the gain stabilises the model", _OF_THEOREM_2, nominal < 0, why),
@@ -184,14 +184,18 @@ def _closed_loop(loop: LoopMatrices) -> Assumption:
         _OF_THEOREM_2,
         true < 0 and nominal < 0,
         f"largest real part of an eigenvalue: {true:.3g} /s (A + BK), {nominal:.3g} /s (Â + B̂K)"
-        f"{_other_sign(loop)}",
+        f"{_with_other_sign(loop)}",
     )
 
 
-def _other_sign(loop: LoopMatrices) -> str:
-    """Return a hint if K seems to be the gain of u = −Kx, the convention of most programs."""
+def other_sign(loop: LoopMatrices) -> str:
+    """Return a hint if K seems to be the gain of u = −Kx, the convention of most programs; else nothing."""
     plus, minus = (spectral_abscissa(loop.A_model + sign * loop.B_model @ loop.K) for sign in (1.0, -1.0))
-    return "; the loop's u is +Kx, and −K would stabilise it" if minus < 0 <= plus else ""
+    return "the loop's u is +Kx, and −K would stabilise it" if minus < 0 <= plus else ""
+
+
+def _with_other_sign(loop: LoopMatrices) -> str:
+    return f"; {hint}" if (hint := other_sign(loop)) else ""
 
 
 def _decay_rate(loop: LoopMatrices, alpha_per_s: float) -> Assumption:
