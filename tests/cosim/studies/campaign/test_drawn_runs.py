@@ -26,6 +26,7 @@ from noack.scenario.resolution import ResolvedRun, loop_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.cosim.studies.campaign.conftest import Few, Write, few_of
+from tests.helpers.shipped import shipped
 
 SHIPPED = Path(__file__).parents[4] / "scenarios"
 COARSE = ("horizon_s=4.0", "plant.rate_hz=50.0", "controller.rate_hz=50.0")
@@ -39,7 +40,7 @@ NEVER = (
 
 
 def scenario(*overrides: str) -> Scenario:
-    return load(SHIPPED / "lane_following.toml", [*COARSE, SPREAD, *overrides])
+    return shipped("lane_following", *COARSE, SPREAD, *overrides)
 
 
 def work(*overrides: str, **changed: Any) -> SampledWork:
@@ -152,7 +153,7 @@ AXIS = {"name": "number", "key": "loops.0.count", "values": [1, 3]}
 
 
 def shared_work(*overrides: str, **settings: Any) -> SharedNetworkWork:
-    scenario = in_virtual_time(load(SHIPPED / "shared_bottleneck.toml", ["horizon_s=2.0", *overrides]))
+    scenario = in_virtual_time(shipped("shared_bottleneck", "horizon_s=2.0", *overrides))
     measured: dict[str, Any] = {"Q": None, "R": None, "settle": 0.5, "most_events": 1000}
     return SharedNetworkWork(scenario, 7, **measured | settings)
 
