@@ -16,7 +16,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.protocol.record_tables import ACKNOWLEDGEMENTS, NETEM_PACKET, UPDATES, Fate
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
+from noack.theory.certificates.assumptions import AssumptionStatus, paper_assumptions
 from tests.helpers.shipped import resolved
 from tests.netem.stepped_link import Link
 
@@ -61,7 +61,7 @@ def test_the_baseline_has_no_claims() -> None:
     assert claim.verdict is ClaimVerdict.VOID
     assert 'network.protocol = "ack"' in claim.why
     assert RunClaims(record).envelopes() == []
-    (assumption,) = [a for a in assumptions(record.scenario) if "acknowledged" in a.what]
+    (assumption,) = [a for a in paper_assumptions(record.scenario) if "acknowledged" in a.what]
     assert assumption.verdict is AssumptionStatus.VIOLATED
     with pytest.raises(CallerError, match=r'network\.protocol = "ack": x_s is reset'):
         continuous_loop_of(record.scenario)

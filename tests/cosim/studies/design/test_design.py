@@ -55,13 +55,14 @@ def scalar_file(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Design:
-    """Runs the command with few draws and rounds; its page is ``p.html``."""
+    """Runs the command with few draws and rounds; its page is ``p.html``; words replace these."""
     monkeypatch.setattr("cosim.studies.design.design_search._MOST_ROUNDS", 3)
 
     def run(scenario: Path, *words: str) -> Result:
-        defaults = ("--settling", "9", "--quantile", "0.5", "--draws", "20", "--weights",
-                    "identity", "--page", str(tmp_path / "p.html"))  # fmt: skip
-        return invoke("design", scenario, *defaults, *words)
+        defaults = {"--settling": "9", "--quantile": "0.5", "--draws": "20", "--weights": "identity",
+                    "--page": str(tmp_path / "p.html")}  # fmt: skip
+        left = [word for option, value in defaults.items() if option not in words for word in (option, value)]
+        return invoke("design", scenario, *left, *words)
 
     return run
 
