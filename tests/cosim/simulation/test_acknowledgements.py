@@ -68,5 +68,5 @@ def test_the_baseline_has_no_claims() -> None:
     assert 'network.protocol = "ack"' in Certificates(record.scenario).answer.text
     with pytest.raises(CallerError, match=r"network\.acknowledgements.*there are none unless"):
         plain("network.acknowledgements.timeout_s=0.1")
-    back = ("network.protocol=none", "network.acknowledgements.timeout_s=0.1")
+    back = ('network.protocol="none"', "network.acknowledgements.timeout_s=0.1")
     assert not plain(*back).protocol.acknowledges
