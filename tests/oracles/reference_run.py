@@ -135,7 +135,8 @@ def observer_of(scenario: Scenario) -> Mapping[str, Array]:
     R = np.diag(noise if observer.noise_std is None else np.square(observer.noise_std))
     if observer.R is not None:
         R = np.array(observer.R)
-    return {"x": x, "P": np.diag(np.square(observer.initial_std)), "Q": Q, "R": R}
+    stated = {} if observer.gains is None else {"gains": np.array(observer.gains)}
+    return {"x": x, "P": np.diag(np.square(observer.initial_std)), "Q": Q, "R": R} | stated
 
 
 def chance_of(scenario: Scenario, packets: Any) -> Chance:

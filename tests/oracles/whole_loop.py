@@ -59,7 +59,8 @@ class Settings:
     timeout_input: str  # from then on: "safe" or "hold"
     watchdog: str  # "hold", "zero" or "model"
     watchdog_timeout_ns: int
-    # first x̂; L, and that of the first measurement if it is another; or P, Q and R of a Kalman filter
+    # first x̂; L, and that of the first measurement if it is another; or P, Q and R of a Kalman filter, and L
+    # at each measurement, if they become constant
     observer: Mapping[str, Array] | None
     actuations_cross: bool  # whether actuations cross the network
     acknowledgement_timeout_ns: int | None  # None: nothing is acknowledged, as in the paper
@@ -123,7 +124,7 @@ class Observer:
     def __init__(self, s: Settings, given: Mapping[str, Array]) -> None:
         self.C, self.given, self.x, self.P = s.C, given, given["x"], given.get("P")
         self.Ad, self.Bd = held_input(s.A_model, s.B_model, s.plant_period_ns)
-        self.first_L = given.get("first_L", given.get("L"))
+        self.first_L, self.corrections = given.get("first_L", given.get("L")), 0
 
     def predict(self, u: Array) -> None:
         """Advance the estimate by a step of the plant."""
@@ -139,8 +140,11 @@ class Observer:
             self.first_L = self.given["L"]
         else:
             L = P @ C.T @ np.linalg.inv(C @ P @ C.T + self.given["R"])
+            if (stated := self.given.get("gains")) is not None:
+                L = stated[min(self.corrections, len(stated) - 1)]
             rest = np.eye(len(P)) - L @ C
             self.P = rest @ P @ rest.T + L @ self.given["R"] @ L.T
+        self.corrections += 1
         self.x = self.x + L @ (y - C @ self.x)
         return self.x
 
