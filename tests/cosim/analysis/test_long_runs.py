@@ -21,7 +21,11 @@ ROUNDED = ("rms", "rms_second_half")
 """Sums: their last bits depend on the order of the terms."""
 
 
-@pytest.fixture(params=["plain", "disturbed", "observed", "acknowledged", "changed"])
+OBSERVED = pytest.param("observed", marks=pytest.mark.deep)
+"""The bounds of a filter whose gains change for long take 12 s."""
+
+
+@pytest.fixture(params=["plain", "disturbed", OBSERVED, "acknowledged", "changed"])
 def record(request: pytest.FixtureRequest, content: dict[str, Any]) -> RunRecord:
     content |= {"horizon_s": 3.0}
     if request.param in ("disturbed", "observed"):
