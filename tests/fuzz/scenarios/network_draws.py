@@ -168,6 +168,7 @@ def _delay(of: Chances, loops: int, horizon_s: float) -> Table:
         kinds = ("uniform", "normal", "pareto", "paretonormal")
         of.put(table, 0.5, "distribution", lambda: of.one_of(*kinds))
         of.put(table, 0.3, "correlation", lambda: of.share(0.9))
+    of.put(table, 0.2, "ordered", lambda: True)
     of.put(table, 0.1, "loss_correlation", lambda: of.between(-1.0, 1.0))
     return table
 
