@@ -17,7 +17,10 @@ class SwitchedLoop(PeriodicLoop):
 
     def __init__(self, edges: Sequence[tuple[int, int, Matrix]]) -> None:
         self.matrices_of = [np.array(M, dtype=float) for _, _, M in edges]
-        self.times, self.between = Times(1, 1, 0, 1, 0, 0, None, False, 1), range(1, 2)
+        # Ticks are far from transmissions, so that each update has one outcome.
+        period = 10**9
+        self.times = Times(period, period, period // 2, period, 0, 0, None, False, 1)
+        self.between = range(1, 2)
         self.guarantee, self.size = Guarantee(0), len(self.matrices_of[0])
         self.bursts = [Burst(v, w, number, 0, 0, 1) for number, (v, w, _) in enumerate(edges)]
 

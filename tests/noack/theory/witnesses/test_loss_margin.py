@@ -149,7 +149,8 @@ def test_the_margin_does_not_depend_on_the_unit_of_the_input() -> None:
         (29.89, 0.045, 0.5, "stable"), (29.894, 0.045, 0.5, "destabilised"),
         # Until the tick after the arrival, then until the plant's next step.
         (29.0, 0.047, 0.5, "stable"), (29.0, 0.048, 0.5, "destabilised"),
-        (29.0, 0.046, 0.2, "stable"), (29.0, 0.047, 0.2, "destabilised"),
+        (29.0, 0.0457, 0.2, "stable"), (29.0, 0.047, 0.2, "destabilised"),
+        (29.0, 0.046, 0.2, "destabilised"),  # at a tick: it acts at this one or at the next one
         (29.0, 0.05, 0.0, "destabilised"),
     ],
 )  # fmt: skip
