@@ -53,6 +53,7 @@ def test_the_lowest_value_is_found_with_few_values(lowest: float) -> None:
     assert min(values.values()) < 1.05
 
 
+@pytest.mark.deep
 def test_a_loop_that_starts_at_rest_is_bounded() -> None:
     """Nothing drives it: bounds of its drift are 0, and have no logarithm."""
     certificates = Certificates(resolved(

@@ -65,6 +65,7 @@ def test_a_plant_that_is_not_linear_is_simulated_in_virtual_time_with_the_reason
     assert run.verdict[0].text.startswith("shaft_angle was ")
 
 
+@pytest.mark.deep
 def test_distances_from_a_reference_are_drawn_with_the_bounds_about_it() -> None:
     explorer = noack_lab.explore("servo_reference", {"horizon_s": 6.0})
     bounds = {curve.panel: curve for curve in explorer.certificate.curves}

@@ -68,7 +68,7 @@ def test_other_output_is_a_line_of_the_log(line: str) -> None:
 
 @pytest.mark.live
 def test_a_run_is_changed_stopped_and_recorded(tmp_path: Path) -> None:
-    scenario = noack.load("double_integrator", {"horizon_s": 60.0, "ports": None})
+    scenario = noack.load("double_integrator", {"horizon_s": 60.0, "ports": None, "certificate.prove": False})
     run = LiveRun(scenario.horizon_s)
 
     async def change_and_stop() -> tuple[str, str]:

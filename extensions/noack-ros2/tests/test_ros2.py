@@ -107,7 +107,16 @@ def test_a_ros2_node_that_does_not_answer_is_named(port: int) -> None:
 def test_an_independent_client_receives_a_live_run(port: int, tmp_path: Path) -> None:
     with node(LISTENER, port) as listener:
         words = ("--listen", "--router", f"tcp/127.0.0.1:{port}", "--runs", tmp_path)
-        result = invoke("bridge", "lane_following", "--set", "horizon_s=3", *AT_RATE, *words)
+        result = invoke(
+            "bridge",
+            "lane_following",
+            "--set",
+            "horizon_s=3",
+            "--set",
+            "certificate.prove=false",
+            *AT_RATE,
+            *words,
+        )
         assert result.exit_code == 0, result.output
         assert listener.stdout is not None
         received = json.loads(listener.stdout.readline())

@@ -80,6 +80,7 @@ def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:
         noack.margin("lane_periodic", most_m=0)
 
 
+@pytest.mark.deep
 def test_a_loop_with_events_has_a_margin_for_all_times_between_them() -> None:
     result = invoke("margin", "double_integrator", *DEADLINE, "--json")
     assert result.exit_code == 0, result.output

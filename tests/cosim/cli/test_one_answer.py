@@ -44,6 +44,7 @@ def test_the_answer_of_certify_is_that_of_margin(period_s: float, losses: int) -
     )
 
 
+@pytest.mark.deep
 def test_a_played_pattern_is_long_enough_to_show_its_growth(tmp_path: Path) -> None:
     margin = noack.margin("lane_periodic", most_m=7, period=False)
     assert margin.destabilised is not None

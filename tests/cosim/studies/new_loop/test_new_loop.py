@@ -281,6 +281,7 @@ class Drive:
 """
 
 
+@pytest.mark.deep
 def test_a_bound_that_says_only_that_the_loop_stays_bounded_is_called_so() -> None:
     Path("drive.py").write_text(CLIPPED)
     made = noack.new("drive.py", "drive.toml")
