@@ -109,7 +109,7 @@ setup-dev: $(VENV)/.installed-dev
 # scenarios in packages when it is imported, and the core is tested without them.
 PYTEST := $(BIN)/python -m pytest
 OF_EXTENSIONS := extensions --override-ini=cache_dir=.pytest_cache/extensions
-AT_ONCE := --numprocesses=$(shell nproc 2>/dev/null || echo 2) --dist=loadgroup
+AT_ONCE := --numprocesses=$(shell nproc 2>/dev/null || echo 2) --dist=loadscope
 # $(call LEVEL,MARKERS): tests at once on all processors, then live tests one by one, with nothing beside them.
 # Exit status 5 of pytest: no test has these markers.
 define LEVEL

@@ -35,7 +35,7 @@ gc.disable()  # until everything is loaded, of which nothing is garbage
 
 settings.register_profile(
     "noack",
-    max_examples=25,
+    max_examples=10,
     deadline=None,
     derandomize=True,
     print_blob=True,

@@ -15,7 +15,6 @@ from noack.scenario.resolution import resolve_run
 from tests.helpers.command_line import invoke
 from tests.helpers.pages import PAGES, blocks, target_exists
 
-pytestmark = pytest.mark.xdist_group("documentation")
 LIVE = {"demo", "run"}
 """Commands that start processes under a real clock."""
 

@@ -333,9 +333,6 @@ def test_the_modules_of_the_checker_are_listed_with_their_sizes() -> None:
 # --- the site -------------------------------------------------------------------------------------
 
 
-IN_THE_SITE = pytest.mark.xdist_group("site")
-
-
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
@@ -348,7 +345,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "html"
 
 
-@IN_THE_SITE
 @pytest.mark.system
 def test_every_page_command_and_public_name_is_there(site: Path) -> None:
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
@@ -361,7 +357,6 @@ def test_every_page_command_and_public_name_is_there(site: Path) -> None:
         assert f'id="noack.{name}"' in text
 
 
-@IN_THE_SITE
 @pytest.mark.system
 def test_the_site_serves_its_own_mathjax(site: Path) -> None:
     for name in ("theory", "derivations", "mansd"):
@@ -373,7 +368,6 @@ def test_the_site_serves_its_own_mathjax(site: Path) -> None:
         assert not re.search(r"\$|\\(?:lVert|beta|frac)", left)
 
 
-@IN_THE_SITE
 @pytest.mark.system
 def test_a_page_loads_no_external_resources(site: Path) -> None:
     for page in site.glob("*.html"):

@@ -34,7 +34,7 @@ from noack.settings.section import Deviations, MatrixRows, require_length, requi
 
 _MOST_GAINS = 1000
 """Gains that are not constant after so many measurements are not stated."""
-_CONSTANT = 1e-6
+_CONSTANT = 1e-8
 """Largest change of a constant gain from one measurement to the next, as a share of its largest entry."""
 _SAME = 1e-6
 """Stated gains differ at most by this share from those that follow from the covariances."""

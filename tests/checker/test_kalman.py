@@ -31,8 +31,6 @@ from tests.helpers.bound_shares import share_of_bound
 from tests.helpers.resolved_tables import first_loop, resolved_tables, tables_of
 from tests.helpers.shipped import shipped
 
-pytestmark = pytest.mark.xdist_group("filter")
-
 SCENARIO = "pendulum_observed"
 Document = Mapping[str, object]
 OFTEN = "plant.measure_every=5"

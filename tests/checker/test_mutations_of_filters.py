@@ -245,7 +245,7 @@ def changed_scenario(name: str, change: str, rng: Rng) -> Tables:
 @pytest.mark.parametrize(
     ("name", "count", "seconds"),
     [
-        ("by gains", 20, 0.1),
+        ("by gains", 8, 0.1),
         pytest.param("by gains", 160, _SECONDS, marks=pytest.mark.deep),
         pytest.param("by forms", 100, _SECONDS, marks=pytest.mark.deep),
     ],

@@ -17,8 +17,6 @@ from noack_check.sentences import assumptions, meaning
 from tests.checker.proofs import use_stored
 from tests.helpers.resolved_tables import resolved_tables
 
-pytestmark = pytest.mark.xdist_group("witness files")
-
 CASES = Path(__file__).parent.parent / "cases"
 
 

@@ -19,7 +19,7 @@ from packaging.requirements import Requirement
 from native.build import HEADER, INTO, LIBRARY
 from tests.helpers.live_runs import EPHEMERAL, PATIENCE_S
 
-pytestmark = [pytest.mark.xdist_group("wheel"), pytest.mark.system]
+pytestmark = [pytest.mark.system]
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {
     name: value

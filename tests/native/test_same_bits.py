@@ -13,7 +13,7 @@ import pytest
 from native.build import LIBRARY
 from tests.native import sanitized_core
 
-pytestmark = [pytest.mark.xdist_group("digests"), pytest.mark.system]
+pytestmark = [pytest.mark.system]
 ROOT = sanitized_core.ROOT
 MODULE = "tests.native.digests"
 

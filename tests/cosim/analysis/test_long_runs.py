@@ -22,7 +22,7 @@ ROUNDED = ("rms", "rms_second_half")
 
 
 OBSERVED = pytest.param("observed", marks=pytest.mark.deep)
-"""The bounds of a filter whose gains change for long take 12 s."""
+"""The bounds of a filter whose gains change for long take 20 s."""
 
 
 @pytest.fixture(params=["plain", "disturbed", OBSERVED, "acknowledged", "changed"])

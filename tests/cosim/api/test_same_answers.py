@@ -17,7 +17,7 @@ import pytest
 import noack
 from tests.helpers.command_line import invoke
 
-pytestmark = [pytest.mark.xdist_group("folder of runs"), pytest.mark.usefixtures("no_searches")]
+pytestmark = [pytest.mark.usefixtures("no_searches")]
 OVERLOADED = {
     "trigger": {"policy": "periodic", "period_s": 0.01},
     "network.impairments": [{"kind": "rate", "rate_bps": 8000}],

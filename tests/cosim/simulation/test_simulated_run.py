@@ -22,8 +22,6 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.helpers.command_line import invoke
 
-pytestmark = pytest.mark.xdist_group("a simulated run")
-
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 LOOPS = (
     'loops=[{ name = "pendulum", count = 2 }, '

@@ -26,7 +26,6 @@ from tests.oracles.reference_run import settings_of, why_not
 from tests.oracles.trigger_rules import Array
 from tests.oracles.whole_loop import NONE
 
-pytestmark = pytest.mark.xdist_group("reference loop")
 SCENARIOS = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
 RANDOM = 96
 """Random scenarios: 8 of each trigger policy."""

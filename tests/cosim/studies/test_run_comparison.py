@@ -14,8 +14,6 @@ from cosim.studies.run_comparison import KeyNumber, RunComparison, compare_runs
 from noack.protocol.record_tables import PLANT_STEP
 from tests.helpers.command_line import invoke
 
-pytestmark = pytest.mark.xdist_group("compared runs")
-
 SETTINGS: list[dict[str, Any]] = [
     {"horizon_s": 3.0},
     {"horizon_s": 3.0, "mode": "zoh"},

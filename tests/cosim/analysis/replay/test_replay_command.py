@@ -15,8 +15,6 @@ from cosim.simulation.virtual_time import simulate_run
 from noack.scenario.scenario_file import load
 from tests.helpers.command_line import invoke
 
-pytestmark = pytest.mark.xdist_group("replayed run")
-
 LANE = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
 
 

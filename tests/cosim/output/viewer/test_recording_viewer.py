@@ -24,9 +24,10 @@ from tests.cosim.output.viewer.recordings import add_samples, another_process, n
 from tests.helpers.live_runs import noack_command
 from tests.helpers.waiting import is_left, wait_for
 
-pytestmark = pytest.mark.skipif(
-    not hasattr(os, "killpg"), reason="tells by process groups what is left behind"
-)
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(not hasattr(os, "killpg"), reason="tells by process groups what is left behind"),
+]
 
 
 def get(url: str, host: str | None = None) -> tuple[int, bytes]:

@@ -109,6 +109,7 @@ def when_files(folder: Path, count: int, process: "subprocess.Popen[str]") -> li
     return psutil.Process(process.pid).children(recursive=True)
 
 
+@pytest.mark.system
 def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
     start: Start, many: Path, tmp_path: Path, run_command: Command
 ) -> None:

@@ -25,8 +25,6 @@ from tests.cosim.studies.design.conftest import LIMITS
 from tests.helpers.approved import compare_lines
 from tests.helpers.command_line import invoke
 
-pytestmark = pytest.mark.xdist_group("a design")
-
 ONE = """
 name = "one"
 horizon_s = 10.0

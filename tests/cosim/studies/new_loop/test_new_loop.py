@@ -179,6 +179,7 @@ def test_a_loop_that_is_not_certified_with_the_fewest_losses_is_not_tried_with_m
     assert len(set(tried)) == 3 * 2 * 2
 
 
+@pytest.mark.deep
 @pytest.mark.usefixtures("short_searches")
 def test_a_run_lasts_until_its_guarantee_has_begun() -> None:
     made = noack.new(noack.gain("unstable_pendulum"), "made.toml", allowed={"angle": 0.003})
@@ -290,11 +291,13 @@ def test_a_bound_that_says_only_that_the_loop_stays_bounded_is_called_so() -> No
     assert made.notes[0].endswith("50 rad/s: it says only that speed stays bounded.")
 
 
+@pytest.mark.deep
 def test_another_rule_is_given_as_a_whole_table() -> None:
     made = noack.new("unstable_pendulum", settings={"trigger": {"policy": "periodic", "period_s": 0.01}})
     assert made.scenario.trigger.policy == "periodic"
 
 
+@pytest.mark.deep
 @pytest.mark.usefixtures("short_searches")
 def test_dry_friction_is_left_out_of_the_model_and_kept_in_the_guarantee() -> None:
     """Its tanh is steep for the speeds of the loop; the class of the readme uses math."""
@@ -318,7 +321,7 @@ def test_dry_friction_is_left_out_of_the_model_and_kept_in_the_guarantee() -> No
 
 
 @pytest.mark.usefixtures("short_searches")
-@pytest.mark.parametrize(("effect", "unit"), [(2.5, 1.0), (0.02, 1000.0)])
+@pytest.mark.parametrize(("effect", "unit"), [(2.5, 1.0), pytest.param(0.02, 1000.0, marks=pytest.mark.deep)])
 def test_units_of_inputs_and_states_do_not_matter(effect: float, unit: float) -> None:
     """A torque in N m, or degrees and a current in mA, instead of a voltage with effect 20 and radians."""
     (code,) = blocks("README.md", "python")

@@ -151,7 +151,7 @@ def test_the_margin_does_not_depend_on_the_unit_of_the_input() -> None:
         (29.0, 0.047, 0.5, "stable"), (29.0, 0.048, 0.5, "destabilised"),
         (29.0, 0.0457, 0.2, "stable"), (29.0, 0.047, 0.2, "destabilised"),
         (29.0, 0.046, 0.2, "destabilised"),  # at a tick: it acts at this one or at the next one
-        (29.0, 0.05, 0.0, "destabilised"),
+        pytest.param(29.0, 0.05, 0.0, "destabilised", marks=pytest.mark.deep),
     ],
 )  # fmt: skip
 def test_a_delay_of_ten_periods_has_the_known_limit(
