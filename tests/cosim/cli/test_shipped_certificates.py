@@ -13,8 +13,8 @@ from tests.helpers.command_line import invoke
 FILES = (Path(__file__).parents[3] / "scenarios").glob("*.toml")
 LIKE_OTHERS = {"lane_5g_arterial", "lane_5g_rural", "lane_weighted"}
 """Other numbers of scenarios that are tried."""
-USUAL = {"unstable_pendulum", "dc_motor_load", "friction_servo", "model_predictive"}
-"""Scenarios that are tried by every ``make test``: a linear plant, a load, equations, no bounds."""
+USUAL = {"unstable_pendulum", "dc_motor_load", "friction_servo", "model_predictive", "priority_channel"}
+"""Scenarios of every ``make test``: a linear plant, a load, equations, no bounds, several loops."""
 SCENARIOS = [
     pytest.param(name, marks=() if name in USUAL else pytest.mark.deep)
     for name in sorted({file.stem for file in FILES} - LIKE_OTHERS)
