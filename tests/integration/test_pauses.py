@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from cosim.record.run_record import RunRecord, load_record
-from noack.protocol.roles import ROLES
+from noack.protocol.roles import LOOP_ROLES, ROLES
 from tests.cosim.output.viewer.recordings import read
 from tests.helpers import live_runs as live
 from tests.helpers.waiting import is_left
@@ -120,3 +120,19 @@ def test_the_recording_is_complete_and_the_stalled_viewer_is_ended(disturbed: Di
     assert sum(chunk.num_rows for chunk in chunks["error/log10"]) > DISTURBED_S * live.RATE_HZ
     live.wait_for(lambda: not is_left(disturbed.viewer_group))
     assert all(live.is_over(viewer) for viewer in disturbed.viewers)
+
+
+def test_a_run_is_complete_though_its_launcher_was_stopped_across_the_horizon(tmp_path: Path) -> None:
+    """Its processes end meanwhile: their last rows and their reports are on disk."""
+    with live.start_runs(tmp_path) as start:
+        running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=16.0))
+        running.wait_recording()
+        processes = [running.child(role) for role in LOOP_ROLES]
+        launcher = psutil.Process(running.process.pid)
+        launcher.send_signal(signal.SIGSTOP)
+        live.wait_for(lambda: all(live.is_over(process) for process in processes))
+        launcher.send_signal(signal.SIGCONT)
+        finished = running.finish()
+    assert finished.summary["exit"] == {"status": 0, "reason": "horizon"}, finished.stderr
+    assert finished.status == 0
+    live.assert_complete(finished.loop)

@@ -101,6 +101,7 @@ def test_the_record_itself_is_explained() -> None:
     assert len(_record()["controller_delivery"]) > 5
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize(
     "setting",
     [

@@ -208,7 +208,10 @@ def test_a_process_refuses_a_run_with_other_certificates(
         ControlPlane(remote(tmp_path / "third", "sensor", tmp_path), "sensor")
 
 
-def test_without_a_run_the_line_says_that_nothing_listens(settings: ListenSettings, tmp_path: Path) -> None:
+def test_without_a_run_the_line_says_that_nothing_listens(
+    settings: ListenSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("noack.runtime.connections.zenoh_session._CONNECT_MS", 200)
     with (
         credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario),
         pytest.raises(NoAnswerError, match="nothing listens there; has `noack record` ended"),
