@@ -122,6 +122,7 @@ def test_the_recording_is_complete_and_the_stalled_viewer_is_ended(disturbed: Di
     assert all(live.is_over(viewer) for viewer in disturbed.viewers)
 
 
+@pytest.mark.system
 def test_a_run_is_complete_though_its_launcher_was_stopped_across_the_horizon(tmp_path: Path) -> None:
     """Its processes end meanwhile: their last rows and their reports are on disk."""
     with live.start_runs(tmp_path) as start:
