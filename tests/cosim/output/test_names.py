@@ -14,6 +14,7 @@ import noack
 from cosim.output.run_document import run_document
 from cosim.output.terminal_writer import print_document
 from noack.core.errors import CallerError
+from tests.helpers.command_line import invoke
 
 CHARACTERS = st.characters(exclude_categories=["C", "Z"], exclude_characters="$")
 NAMES = st.one_of(
@@ -83,3 +84,9 @@ def assert_survives(folder: Path, names: list[str]) -> None:
     assert run.save_tables(folder / "tables")
     assert run.export(folder / "run.mat", certificates=False)
     assert run.export(folder / "csv")
+
+
+def test_a_bracket_in_the_name_of_an_output_is_shown_by_the_command(tmp_path: Path) -> None:
+    case = Path(__file__).parents[2] / "cases" / "bracket.toml"
+    assert invoke("simulate", case, "--no-report", "--runs", tmp_path).exit_code == 0
+    assert "lateral offset [m] was at most 3 m" in invoke("summary", tmp_path / "latest").stdout
