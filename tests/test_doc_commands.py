@@ -91,10 +91,11 @@ SHORTER = {
 def shorter(words: list[str]) -> list[str]:
     more = list(("--effort", "5") if "--effort" in words else SHORTER.get(words[0], ()))
     more = ["--figure", "errors"] if "pdf" in words else more
-    if "horizon_s" in " ".join(words) and words[0] != "adversary":
-        more = more[:1]
+    if "horizon_s" in " ".join(words):
+        more = more[2:] if words[0] == "adversary" else more[:1]
     for option in ({*more} & {*words}) - {"--set"}:  # it is given once
-        words = words[: words.index(option)] + words[words.index(option) + 2 :]
+        value = 0 if option.startswith("--no-") else 1
+        words = words[: words.index(option)] + words[words.index(option) + 1 + value :]
     return [*words, *more]
 
 
