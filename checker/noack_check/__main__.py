@@ -1,5 +1,7 @@
 """``noack-check witness.json [--scenario resolved.toml] [--equations FILE]``: verifies a file of witnesses.
 
+``noack-check DOCUMENT PROOF`` verifies a proof of a loop document instead, by :mod:`noack_kernel`.
+
 Prints PROVED and what was proven, for each statement of the file, or REJECTED and the first inequality
 that fails. Exit status: 0 if all are proven, 1 if one is not, 2 for a file that cannot be read or written.
 
@@ -29,6 +31,7 @@ from noack_check.sentences import (
     quoted,
     sentences,
 )
+from noack_kernel.__main__ import verify
 
 _PLANTS = {
     "own": "its plant",
@@ -47,6 +50,13 @@ def main() -> None:
         type=Path,
         help="file that `noack certify NAME --witness FILE` or `noack margin` with --witness has written",
     )
+    parser.add_argument(
+        "proof",
+        type=Path,
+        nargs="?",
+        help="with a loop document as the first file: the proof of its bounds; both by `noack certify NAME "
+        "--document DOCUMENT --proof PROOF`",
+    )
     parser.add_argument("--scenario", type=Path, help="the scenario, by `noack check NAME --resolved`")
     parser.add_argument(
         "--equations",
@@ -55,6 +65,10 @@ def main() -> None:
         "equations needs them",
     )
     arguments = parser.parse_args()
+    if arguments.proof is not None:
+        if arguments.scenario is not None or arguments.equations is not None:
+            parser.error("a loop document needs neither --scenario nor --equations")
+        sys.exit(verify(arguments.witness, arguments.proof))
     try:
         file = read_json(arguments.witness)
         given = None if arguments.scenario is None else read_toml(arguments.scenario)

@@ -89,6 +89,27 @@ class Unknown(NamedTuple):
     """A row C and k ≥ 0 with p·Cz ≥ k p², as of friction."""
 
 
+class Signal(NamedTuple):
+    """An unknown signal p in ż = Fz + ``column`` p with |p| ≤ ``size`` |``row`` z|."""
+
+    column: arb_mat
+    row: arb_mat
+    size: arb
+    along: Along | None
+
+    @property
+    def plain(self) -> Unknown:
+        """The signal itself."""
+        return Unknown(self.column, self.size * self.row, self.along)
+
+    @property
+    def scaled(self) -> Unknown:
+        """The signal over the root of its size: then a search has numbers of similar size."""
+        root = self.size.sqrt()
+        along = None if self.along is None else Along(self.along.row, root * self.along.least)
+        return Unknown(root * self.column, root * self.row, along)
+
+
 class Flow(NamedTuple):
     """ż = ``matrix`` z + Σ column p, with the input u = ``input`` z."""
 
@@ -244,29 +265,31 @@ class Model:
             raise ValueError("noise: that of the observer is missing")
         self.bounds = noise = noise or loop.plain_noise
         smooth = range(n + (2 + copies) * q, n + (2 + copies) * q + noise.smooth.rates.nrows())
-        self._sources = range(smooth.stop, smooth.stop + noise.columns.ncols())
-        memories = range(self._sources.stop, self._sources.stop + (self.memory is not None))
+        self.sources = range(smooth.stop, smooth.stop + noise.columns.ncols())
+        memories = range(self.sources.stop, self.sources.stop + (self.memory is not None))
         self.size = memories.stop + 2
         every = identity(self.size)
         self.x = rows_of(every, range(n))
-        self._errors = [rows_of(every, range(i, i + q)) for i in range(n, smooth.start, q)]
-        self._error, self.w, *self.v = self._errors if seen is None else [lift * e for e in self._errors]
-        self.s, self.p = rows_of(every, smooth), rows_of(every, self._sources)
-        self._moving = rows_of(self.x, range(n - loop.loads))
+        self.error_rows = [rows_of(every, range(i, i + q)) for i in range(n, smooth.start, q)]
+        self._error, self.w, *self.v = (
+            self.error_rows if seen is None else [lift * e for e in self.error_rows]
+        )
+        self.s, self.p = rows_of(every, smooth), rows_of(every, self.sources)
+        self.moving = rows_of(self.x, range(n - loop.loads))
         self._decaying = noise.smooth.columns * self.s if smooth else 0 * self.x
         self.y = rows_of(every, memories)
         self.e = self._error + self._decaying if smooth else self._error
         self.f1, self.f2 = (rows_of(every, [self.size - 2 + i]) for i in range(2))
         self.noise = 1 * self._decaying
-        if self._sources:
+        if self.sources:
             self.noise += noise.columns * self.p
-        units = [self.f1] * noise.decaying + [self.f2] * len(self._sources)
-        bounds = zip(self._sources, units, strict=False)
-        self._noise_bounds = tuple(square(rows_of(every, [i])) - square(unit) for i, unit in bounds)
+        units = [self.f1] * noise.decaying + [self.f2] * len(self.sources)
+        bounds = zip(self.sources, units, strict=False)
+        self.noise_bounds = tuple(square(rows_of(every, [i])) - square(unit) for i, unit in bounds)
         self._has_f1 = loop.has_decaying_unit(rate)
         self.level, self.floor = thresholds(loop, rate)
         self.silent = self._comparison(self.level, self.floor)
-        self._guards = self._event_guards()
+        self.guards = self._event_guards()
         self._forms: dict[tuple[int, int], Form] = {}
         self.locations = self._locations() if self._places is None else self._locations_by_tests(self._places)
         self.edges = self._edges() if self._places is None else self._edges_by_tests(self._places)
@@ -305,10 +328,10 @@ class Model:
 
     def _measured(self, rows: arb_mat) -> arb_mat:
         """Return the square of some rows of a measurement and its error."""
-        return square(rows * self._pair) if rows.nrows() else zeros(self.size, self.size)
+        return square(rows * self.pair) if rows.nrows() else zeros(self.size, self.size)
 
     @property
-    def _pair(self) -> arb_mat:
+    def pair(self) -> arb_mat:
         """A measurement, and its error."""
         error = self.e - self.noise
         return stack([self.x + self.noise, self.loop.gain * error if self.loop.rule.of_input else error])
@@ -321,11 +344,11 @@ class Model:
         losses, times = self.loop.losses, self.loop.times
         flows = self._flows(self._gains())
         tested: tuple[arb, ...] = (arb(0), arb(times.sampling)) if times.sampling > 0 else (arb(0),)
-        silent = () if times.sampling > 0 or self.is_periodic else (self.silent, *self._noise_bounds)
+        silent = () if times.sampling > 0 or self.is_periodic else (self.silent, *self.noise_bounds)
         if self.is_periodic:
             tested = self._nodes_until(times.period)
         assumed = self._assumed() if times.sampling > 0 else ()
-        if assumed and not self._units() <= set(self._guards):
+        if assumed and not self.is_guarded:
             tested = (arb(0),)  # an input may act at any time after a test, and leaves all c as they are
         found = []
         for lost in range(losses + 1):
@@ -390,10 +413,15 @@ class Model:
         """Return those of x, e, w, some v and the units."""
         n, first = self.loop.n, self.size - 2
         units = ([first] if self._has_f1 else []) + ([first + 1] if self.loop.needs_constant else [])
-        q, s = self._seen.nrows(), self._sources.start - self.s.nrows()
+        q, s = self._seen.nrows(), self.sources.start - self.s.nrows()
         w, v = range(n + q, n + 2 * q) if has_w else range(0), range(n + 2 * q, n + (2 + copies) * q)
-        known = (*range(n - self.loop.loads), *range(n, n + q), *w, *v, *range(s, self._sources.start))
-        return (*known, *range(self._sources.stop, first), *units)
+        known = (*range(n - self.loop.loads), *range(n, n + q), *w, *v, *range(s, self.sources.start))
+        return (*known, *range(self.sources.stop, first), *units)
+
+    @property
+    def is_guarded(self) -> bool:
+        """Whether events have a guard in each unit, so that locations have a c of their own."""
+        return self._units() <= set(self.guards)
 
     def _units(self) -> set[str]:
         """Return the names of c of all units."""
@@ -401,13 +429,14 @@ class Model:
 
     def _assumed(self) -> tuple[arb_mat, ...]:
         """Return ‖W e_s‖² minus its bound, if one is assumed."""
-        return self._at_most(self.e, arb(1))
+        return self.at_most(self.e, arb(1))
 
     def _chain(self, lost: int, sent: int) -> tuple[arb_mat, ...]:
         """Return ‖W w‖² minus its bound by the chain, if that is known."""
-        return self._at_most(self.w, self.errors.chain.factor(lost, sent)) if self.errors else ()
+        return self.at_most(self.w, self.errors.chain.factor(lost, sent)) if self.errors else ()
 
-    def _at_most(self, error: arb_mat, factor: arb) -> tuple[arb_mat, ...]:
+    def at_most(self, error: arb_mat, factor: arb) -> tuple[arb_mat, ...]:
+        """Return ‖W error‖² minus a multiple of what is assumed of ‖W e_s‖², if that is."""
         if self.errors is None:
             return ()
         assumed = self.errors.decaying**2 * square(self.f1) + self.errors.constant**2 * square(self.f2)
@@ -457,10 +486,10 @@ class Model:
             units = 0 * self.p, 0 * self.y, -self.rate * self.f1, 0 * self.f2
             moved = [self._reduced(each) for each in (error, H * self.w, *copies)]
             matrix = stack([velocity, *moved, smooth, *units])
-            found.append(Flow(matrix, (*self._unknowns(u), *further), u))
+            found.append(Flow(matrix, (*(signal.scaled for signal in self.signals(u)), *further), u))
         return tuple(found)
 
-    def _unknowns(self, u: arb_mat) -> Iterator[Unknown]:
+    def signals(self, u: arb_mat) -> Iterator[Signal]:
         """Yield what moves x in an unknown way: entries of A and B, and disturbances."""
         loop, n = self.loop, self.loop.n
         for half, signal in ((loop.half_A, self.x), (loop.half_B, u)):
@@ -468,19 +497,17 @@ class Model:
                 for k in range(half.ncols()):
                     if half[i, k] == 0:  # false for a ball around 0
                         continue
-                    root = half[i, k].sqrt()
-                    row = rows_of(signal, [k])
-                    yield Unknown(self._push(columns_of(root * identity(n), [i])), root * row)
+                    column = self._push(columns_of(identity(n), [i]))
+                    yield Signal(column, rows_of(signal, [k]), half[i, k], None)
         for index, size in enumerate(loop.sizes):
-            root = size.sqrt()
-            column, along = self._push(root * columns_of(loop.pushes, [index])), None
+            column, along = self._push(columns_of(loop.pushes, [index])), None
             if loop.along and not is_zero((known := loop.along[index]).row):
-                along = Along(known.row * stack([self.x, u]), root * known.least)
-            yield Unknown(column, root * self.f2, along)
+                along = Along(known.row * stack([self.x, u]), known.least)
+            yield Signal(column, self.f2, size, along)
 
     def _push(self, column: arb_mat) -> arb_mat:
         """Return the column of ż for one of ẋ."""
-        return transpose(self.x) * column - transpose(self._errors[0]) * self._reduced(column)
+        return transpose(self.x) * column - transpose(self.error_rows[0]) * self._reduced(column)
 
     @property
     def _waiting(self) -> int:
@@ -489,7 +516,7 @@ class Model:
 
     def _edges(self) -> list[Edge]:
         losses = self.loop.losses
-        event = (*self._guards.values(), *self._noise_bounds)
+        event = (*self.guards.values(), *self.noise_bounds)
         delivered = self.jump(self.noise, 0 * self.w, ())
         sent = self.jump(self.noise, self.w + self.e - self.noise, ())
         lost = self.jump(self.e, self.w, ()) if self.is_periodic else sent
@@ -502,8 +529,8 @@ class Model:
                 found.append(Edge(f"{j} lost, delivered", j, 0, tests, delivered, event, True))
             if j < losses:
                 found.append(Edge(f"{j} lost, lost", j, j + 1, tests, lost, event, True))
-            if self._has_silent_edges:
-                silent, stays = (self.silent, *self._noise_bounds), identity(self.size)
+            if self.has_silent_edges:
+                silent, stays = (self.silent, *self.noise_bounds), identity(self.size)
                 found.append(Edge(f"{j} lost, silent", j, j, ((1, 0),), stays, silent, True))
         for later in range(self._waiting):
             found += self._on_its_way(losses + 1 + later, later, self.later)
@@ -521,7 +548,7 @@ class Model:
         """Yield the edges of a location in which an update is on its way that has so many later ones."""
         losses, name = self.loop.losses, self.locations[source].name
         if later < most:
-            event, added = (*self._guards.values(), *self._noise_bounds), self.e - self.noise
+            event, added = (*self.guards.values(), *self.noise_bounds), self.e - self.noise
             jump = self.jump(self.noise, self.w + added, [v + added for v in self.v[:later]] + [added])
             pairs = self._events_while_waiting(source)
             yield Edge(f"{name}, event", source, source + 1, pairs, jump, event, True)
@@ -615,8 +642,8 @@ class Model:
         if move.kind == "arrival":
             return ()
         if move.is_event:
-            return (*self._guards.values(), *self._noise_bounds)
-        return (self.silent, *self._noise_bounds)
+            return (*self.guards.values(), *self.noise_bounds)
+        return (self.silent, *self.noise_bounds)
 
     def _jump_of(self, move: Move) -> arb_mat:
         """Return what becomes of z; see the edges of loops whose tests may be at any time."""
@@ -638,7 +665,7 @@ class Model:
         """
         eta, decay = square(self.y), (-1 * memory.decay * until).exp()
         gained = arb(until) if memory.decay == 0 else (1 - decay) / memory.decay
-        n, pair = self.loop.n, self._pair
+        n, pair = self.loop.n, self.pair
         if resets:
             pair = stack([rows_of(pair, range(n)), zeros(pair.nrows() - n, self.size)])
         return decay * eta + gained * (transpose(pair) * memory.gain * pair)
@@ -655,10 +682,10 @@ class Model:
         return 0.0 if self.memory is None else float(self.memory.start.sqrt().mid())
 
     @property
-    def _has_silent_edges(self) -> bool:
+    def has_silent_edges(self) -> bool:
         """Whether V has to be shown not to grow at a silent test."""
         changes = len(self.locations[0].nodes) > 1 and not self.is_periodic
-        return bool(self._sources) and changes and self.loop.rule.positive.nrows() > 0
+        return bool(self.sources) and changes and self.loop.rule.positive.nrows() > 0
 
     # The quadratic forms.
 
@@ -680,26 +707,26 @@ class Model:
     def _new_form(self, location: int, node: int) -> Form:
         place = self.locations[location]
         rule, E = self.loop.rule, columns_of(identity(self.size), place.coordinates)
-        errors = stack([f for f in self._errors if not is_zero(f * E)])
+        errors = stack([f for f in self.error_rows if not is_zero(f * E)])
         by_node = self.is_periodic or not place.is_tested
         own = f"{place.name}, {node}" if by_node else place.name
         starts = place.name.startswith("start")
         X = f"X/start, {node}" if starts else "X"
         parts: tuple[tuple[str, arb_mat], ...] = (
-            (X, stack([self._moving, self.s]) * E),
+            (X, stack([self.moving, self.s]) * E),
             (f"Q/{own}", errors * E),
         )
         if rule.negative.nrows() or self.is_periodic:
-            parts = ((f"P/{own}", stack([self._moving, self.s, errors]) * E),)
+            parts = ((f"P/{own}", stack([self.moving, self.s, errors]) * E),)
         units = [(name, f) for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)]
         scalars = []
         for name, f in units:
             common = f"{name}/start, {node}" if starts else name
-            is_own = name in self._guards or self.is_periodic
+            is_own = name in self.guards or self.is_periodic
             scalars.append((f"{name}/{own}" if is_own else common, -1 * square(f * E)))
         if place.is_tested and node and rule.positive.nrows():
             compared = {"": self.silent}
-            if self._has_silent_edges:
+            if self.has_silent_edges:
                 compared = {"": self._measured(rule.positive), "/N": -1 * self._measured(rule.negative)}
                 sizes = ("c1", self.f1, self.level), ("c2", self.f2, self.floor)
                 compared |= {f"/{name}": -1 * square(f) for name, f, size in sizes if size > 0}
@@ -714,9 +741,9 @@ class Model:
         T is the time to the next test, and P' belongs to the node. So all matrices of a witness are about
         as large, however small T is. The same holds for the coefficients of f₁², f₂² and y².
         """
-        place, names = self.locations[location], self._names_by_tests(location, node)
+        place, names = self.locations[location], self.names_by_tests(location, node)
         E = columns_of(identity(self.size), place.coordinates)
-        rows = stack([self.x, self.s, *(f for f in self._errors if not is_zero(f * E))]) * E
+        rows = stack([self.x, self.s, *(f for f in self.error_rows if not is_zero(f * E))]) * E
         squares = [("c1", -1 * square(self.f1 * E)), ("c2", -1 * square(self.f2 * E))]
         squares = [(letter, M) for letter, M in squares if not is_zero(M)]
         if self.memory is not None:
@@ -727,7 +754,7 @@ class Model:
             scalars = [s for s in scalars if not s[0].startswith("c1")] + [("c1", -1 * square(self.f1 * E))]
         return Form(parts, tuple(scalars))
 
-    def _names_by_tests(self, location: int, node: int) -> list[tuple[str, arb]]:
+    def names_by_tests(self, location: int, node: int) -> list[tuple[str, arb]]:
         """Return the names of P and P', with their factors; of P alone where it is first used.
 
         Where no update is on its way, P' is affine in the number of silent tests, between :func:`_knots`.
@@ -773,7 +800,7 @@ class Model:
 
     def _add_memory(self, terms: "_Terms", location: int, node: int, M: arb_mat) -> None:
         """Add the coefficient of y² times M."""
-        for name, size in self._names_by_tests(location, node):
+        for name, size in self.names_by_tests(location, node):
             terms.scalar(f"eta/{name}", size * M)
 
     def output_inequalities(self, output: str) -> Iterator[Inequality]:
@@ -880,8 +907,8 @@ class Model:
             motion -= transpose(self.y) * self.y * motion
         jump = rows_of(motion, target.coordinates)
         facts = edge.facts
-        if self._units() <= set(self._guards):
-            facts += source.facts + (() if self._sources else source.silent)
+        if self.is_guarded:
+            facts += source.facts + (() if self.sources else source.silent)
         for node, target_node in edge.pairs:
             terms = _Terms(E.ncols())
             terms.add(self.form(edge.source, node), z, z, arb(1) / 2)
@@ -895,19 +922,35 @@ class Model:
 
     def _columns(self, place: Location, *, with_noise: bool) -> arb_mat:
         """Return the columns of a location's coordinates, and of the noise."""
-        return columns_of(identity(self.size), (*place.coordinates, *(self._sources if with_noise else ())))
+        return columns_of(identity(self.size), (*place.coordinates, *(self.sources if with_noise else ())))
 
-    def start_inequality(self) -> Inequality:
-        """V(z(0)) ≤ Σ m q: e = n at the start, for all p; η ≥ 0. The columns of z are a constant, and p."""
-        index = self.loop.losses + 1 + self._waiting if self.loop.times.start > 0 else 0
+    @property
+    def start_location(self) -> int:
+        """The location at t = 0."""
         if self._places is not None:
-            index = self._places.places.index(self._places.start)
+            return self._places.places.index(self._places.start)
+        return self.loop.losses + 1 + self._waiting if self.loop.times.start > 0 else 0
+
+    @property
+    def start_columns(self) -> arb_mat:
+        """z(0) = Z (1, p): e = n at the start."""
         z = transpose(self.x) * self.loop.start + transpose(self.f1) + transpose(self.f2)
         if self.s.nrows():
             z += transpose(self.s) * self.bounds.smooth.start
-        if self._sources:
-            error = transpose(self._errors[0]) * self._reduced(self.bounds.columns)
+        if self.sources:
+            error = transpose(self.error_rows[0]) * self._reduced(self.bounds.columns)
             z = beside(z, error + transpose(self.p))
+        return z
+
+    def clock_of_place(self, location: int) -> fmpq:
+        """Return the time from a test to the next one, or until an update on its way has surely acted."""
+        if self._places is None:
+            raise ValueError("no forms of each test")
+        return self._places.clock_limit(self._places.places[location])
+
+    def start_inequality(self) -> Inequality:
+        """V(z(0)) ≤ Σ m q: e = n at the start, for all p; η ≥ 0. The columns of z are a constant, and p."""
+        index, z = self.start_location, self.start_columns
         at_start = rows_of(z, self.locations[index].coordinates)
         terms = _Terms(z.ncols())
         terms.add(self.form(index, 0), at_start, at_start, arb(-1) / 2)
@@ -916,7 +959,7 @@ class Model:
             Q = self._next_memory(self.memory, until, resets=True)
             z_eta = z + transpose(self.y) * arb_mat(1, z.ncols(), [root] + [0] * (z.ncols() - 1))
             self._add_memory(terms, index, 0, -1 * (transpose(z_eta) * Q * z_eta))
-        terms.facts("m/start", self._noise_bounds, z)
+        terms.facts("m/start", self.noise_bounds, z)
         return terms.inequality("start", index, -1)
 
 

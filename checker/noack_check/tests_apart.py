@@ -94,6 +94,11 @@ class Places:
         """Return the time until the next test."""
         return self._times.dwell if place.dwells else self._times.sampling
 
+    def clock_limit(self, place: Place) -> fmpq:
+        """Return the time until the next test, or until the next update has surely acted."""
+        limit, end = self._limit(place), self.clock_end(place)
+        return end if limit is None else min(end, limit - place.ages[0])
+
     def _limit(self, place: Place) -> fmpq | None:
         """Return the age up to which the update acts that is the next one; None: none is on its way."""
         if not place.ages:

@@ -59,6 +59,8 @@ class WitnessedStatement(NamedTuple):
     """Why there is no witness."""
     bounds: ProvenBounds | None = None
     """What is proven, as certificates have it."""
+    loop: Loop | None = None
+    """What it is proven of."""
 
 
 class Unproven(NamedTuple):
@@ -204,7 +206,7 @@ def find_statement(
     except (RefusedError, NoWitnessError, NotEnclosedError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
-    return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds)
+    return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds, loop)
 
 
 def plant_on_regions(

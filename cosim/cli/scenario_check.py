@@ -5,13 +5,16 @@ from collections.abc import Iterator
 from rich.console import Console
 
 from controller_node.controller import law_of
+from cosim.analysis.loop_files import files_of_widest
 from cosim.analysis.summary.plant_linearisation import linearisation, linearisation_rows
+from cosim.analysis.witnesses import find_witnesses
 from cosim.cli.printing import console as standard_console
 from cosim.cli.printing import print_json
 from cosim.live.launcher import DEFAULT_START_S
 from cosim.output.run_document import assumption_table
 from cosim.output.terminal_writer import terminal_table
 from noack.core.clock import NS_PER_S
+from noack.proof.words import in_words
 from noack.scenario.resolution import ResolvedRun, policy_of, resolve
 from noack.scenario.scenario import Scenario, loop_names
 from noack.scenario.scenario_file import dumps
@@ -52,6 +55,14 @@ def print_resolved(loaded: Scenario, *, json: bool) -> None:
         print_json(stated.model_dump(mode="json"))
     else:
         print(dumps(stated), end="")
+
+
+def print_document(loaded: Scenario, *, json: bool) -> None:
+    """Print the loop document of a proof that is known, in words; raise CallerError if none is."""
+    resolved = resolve(loaded)
+    known = find_witnesses(resolved, most_work=0.0, conditions=("schedule",))
+    files = files_of_widest(resolved, known)
+    print(files.document if json else in_words(files.table), end="" if json else "\n")
 
 
 def _make_trigger(resolved: Scenario) -> None:

@@ -71,6 +71,7 @@ def _print_shipped(files: Sequence[ShippedFile]) -> None:
         ("noack check lane_following", "print the scenario and its assumptions"),
         ("noack check lane_following --set mode=zoh --json", "as JSON"),
         ("noack check shared_channel --resolved --loop lane-1", "one loop, in numbers only"),
+        ("noack check lane_following --document", "what its bounds are proven of, in words"),
     ),
 )
 def check(
@@ -79,6 +80,14 @@ def check(
     network: opt.NetworkOption = None,
     resolved: Annotated[
         bool, Option("--resolved", help="Print one loop with numbers only, also for times that have none.")
+    ] = False,
+    document: Annotated[
+        bool,
+        Option(
+            "--document",
+            help="Print in words what the bounds are proven of: the loop document; "
+            "`noack certify NAME` searches the proof.",
+        ),
     ] = False,
     loop: opt.LoopOption = None,
     json: opt.JsonOption = False,
@@ -89,10 +98,15 @@ def check(
 
     A nonlinear plant is also started and linearised. For a plant in Python this runs its code.
     """
-    from cosim.cli.scenario_check import check_scenario, print_resolved
+    from cosim.cli.scenario_check import check_scenario, print_document, print_resolved
 
     loaded = opt.load_loop(scenario, settings, loop, network)
-    print_resolved(loaded, json=json) if resolved else check_scenario(loaded, json=json)
+    if document:
+        print_document(loaded, json=json)
+    elif resolved:
+        print_resolved(loaded, json=json)
+    else:
+        check_scenario(loaded, json=json)
 
 
 @app.command(

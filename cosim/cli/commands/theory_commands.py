@@ -29,6 +29,7 @@ app = typer.Typer()
         ("noack certify lane_following --verbose", "every bound, setting and assumption"),
         ("noack certify lane_weighted --late 6 --json", "allow 6 steps of lateness"),
         ("noack certify lane_following --witness lane.json", "for the program noack-check"),
+        ("noack certify lane_following --document loop.json --proof proof.json", "as two files"),
         ("noack certify lane_following --require certificate", "exit status 1 if there is none"),
     ),
 )
@@ -76,6 +77,21 @@ def certify(
             "--equations.",
         ),
     ] = None,
+    document: Annotated[
+        Path | None,
+        Option(
+            callback=opt.usable_path,
+            help="Write the loop document, which the bounds are proven of, to this file (.json) for "
+            "noack-check; `noack check NAME --document` prints it in words.",
+        ),
+    ] = None,
+    proof: Annotated[
+        Path | None,
+        Option(
+            callback=opt.usable_path,
+            help="Write the proof of the document's bounds to this file (.json), for noack-check.",
+        ),
+    ] = None,
     search: Annotated[
         bool,
         Option(
@@ -102,6 +118,7 @@ def certify(
     Each bound was verified by noack-check. What is found is kept in the cache folder of the user.
     """
     from cosim.analysis.certificates import certificates_of
+    from cosim.analysis.loop_files import files_of_widest
     from cosim.analysis.witnesses import require_covered
     from cosim.live.monitoring.progress import work_bar
     from cosim.output.certificate_report import certificate_document
@@ -116,6 +133,8 @@ def certify(
         require_suffix(out, "--out", ".mat")
     if equations is not None and witness is None:
         raise CallerError("--equations: the equations are those of the witnesses; add --witness FILE")
+    if (document is None) != (proof is None):
+        raise CallerError("--document and --proof: noack-check needs both files; add the other option")
     loaded = opt.load_loop(scenario, settings, loop, network)
     if witness is not None:
         require_covered(own := resolve(loaded))
@@ -131,11 +150,16 @@ def certify(
         if equations is not None:
             write_output(equations, witnesses.equations_text())
             print_to_stderr(f"noack: wrote {equations}; compare it with the plant's code")
+    if document is not None and proof is not None:
+        files = files_of_widest(result.scenario, witnesses)
+        write_output(document, files.document)
+        write_output(proof, files.proof)
+        print_to_stderr(f"noack: wrote {document} and {proof}; noack-check {document} {proof} verifies them")
     if search:
         with work_bar("trying smaller thresholds", lines=True) as bar:
             result.advise(bar)
-    document = certificate_document(result, verbose=verbose or tables is not None, paper=paper)
-    show(document, json=json, tables=tables)
+    page = certificate_document(result, verbose=verbose or tables is not None, paper=paper)
+    show(page, json=json, tables=tables)
     if out is not None:
         save_mat(result.to_json(), out)
     if witness is not None and not witnesses.are_any:

@@ -1,0 +1,440 @@
+"""A loop document: what it says of a loop, read strictly. Rule R0 (well-formed) is here.
+
+z is the vector of the document's coordinates. In a location z moves as the corners of a motion say, and a
+clock runs. An edge may be taken while the clock is in an interval and the edge's facts hold; it sets
+z := J z. A fact is an inequality Σ|Rz|² ≤ Σ|R'z|². Nothing here knows a trigger, a network or a scenario.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from flint import fmpq
+
+from noack_kernel.exact import Matrix, RejectedError, decimal, rational, read_matrix, square, whole, zeros
+
+FORMAT = "noack-hybrid 1"
+MOST_BYTES = 64 * 2**20
+MOST_COORDINATES, MOST_LOCATIONS, MOST_NODES = 60, 200, 64
+MOST_NAME = 200
+MOST_TEXT = 2000
+Table = Mapping[str, object]
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A signal p in ż = … + ``column`` p with |p| ≤ |``rows`` z|, and p·(``along`` z) ≥ ``least`` p²."""
+
+    column: Matrix
+    rows: Matrix
+    along: Matrix | None
+    least: fmpq
+
+
+@dataclass(frozen=True)
+class Corner:
+    """ż = ``matrix`` z + Σ column p, with the input u = ``input`` z. A motion is any mixture of corners."""
+
+    matrix: Matrix
+    input: Matrix
+    unknown: tuple[Unknown, ...]
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where z moves until an edge is taken. Its ``facts`` hold all the time."""
+
+    name: str
+    coordinates: tuple[int, ...]
+    """The others are 0 here. Those of the units are among them."""
+    clock: fmpq | None
+    """The largest value of the clock, s; None: no limit."""
+    motion: tuple[Corner, ...]
+    facts: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Edge:
+    """z := ``jump`` z, possible while the clock is in [``first``, ``last``] and the facts hold."""
+
+    name: str
+    source: str
+    target: str | None
+    """None: the document says nothing of what follows. A proof has to show that the edge is never taken."""
+    first: fmpq
+    last: fmpq | None
+    clock: str
+    """What becomes of the clock: "zero", "keeps", or "any" value that the target allows."""
+    facts: tuple[str, ...]
+    jump: Matrix
+
+
+@dataclass(frozen=True)
+class Output:
+    """y = ``velocity`` ż + ``rows`` z, or an entry of u."""
+
+    name: str
+    unit: str
+    rows: Matrix | None
+    velocity: Matrix | None
+    input: int | None
+    locations: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The document describes the loop until |output| reaches ``less``."""
+
+    output: str
+    less: fmpq
+
+
+class Document:
+    """A document that is well-formed (R0).
+
+    Args:
+        text: the content of its file.
+
+    Raises:
+        RejectedError: it breaks a rule of the format; the message names the place.
+    """
+
+    def __init__(self, text: str) -> None:
+        table = read_table(text, FORMAT)
+        required = {
+            "format",
+            "name",
+            "coordinates",
+            "rows",
+            "facts",
+            "motions",
+            "locations",
+            "edges",
+            "start",
+        }
+        fields(
+            table, "document", required | {"outputs"}, {"decaying", "constant", "readings", "while", "about"}
+        )
+        self.digest = hashlib.sha256(text.encode()).hexdigest()
+        self.name = name_of(table["name"], "name")
+        self.coordinates, self.units_of, self.noise = self._read_coordinates(table["coordinates"])
+        self.size = len(self.coordinates)
+        self.rate, self.decaying, self.constant = self._read_units(table)
+        self.units = [i for i in (self.decaying, self.constant) if i is not None]
+        self.states = [i for i in range(self.size) if i not in self.noise]
+        self.rows = {name: self._rows(rows, name) for name, rows in mapping(table["rows"], "rows").items()}
+        self.facts = {name: self._fact(name, f) for name, f in mapping(table["facts"], "facts").items()}
+        motions = mapping(table["motions"], "motions")
+        self.motions = {name: self._motion(name, corners) for name, corners in motions.items()}
+        found = [self._location(entry) for entry in entries(table["locations"], "locations")]
+        self.locations = {location.name: location for location in found}
+        self.edges = [self._edge(entry) for entry in entries(table["edges"], "edges")]
+        _unique([location.name for location in found], "locations", MOST_LOCATIONS)
+        _unique([edge.name for edge in self.edges], "edges")
+        self._read_start(table["start"])
+        outputs = [self._output(entry) for entry in entries(table["outputs"], "outputs")]
+        _unique([output.name for output in outputs], "outputs")
+        self.outputs = {output.name: output for output in outputs}
+        self.limits = [self._limit(entry) for entry in entries(table.get("while", []), "while")]
+        for name, reading in mapping(table.get("readings", {}), "readings").items():
+            self._read_reading(name, reading)
+
+    # Coordinates and units.
+
+    def _read_coordinates(self, value: object) -> tuple[list[str], list[str], list[int]]:
+        names, units, noise = [], [], []
+        for index, entry in enumerate(entries(value, "coordinates")):
+            fields(entry, f"coordinate {index}", {"name", "unit"}, {"noise"})
+            names.append(name_of(entry["name"], "coordinates"))
+            units.append(text_of(entry["unit"], "coordinates"))
+            if entry.get("noise", False) not in (False, True):
+                raise RejectedError(f"{names[-1]}: noise is true or false")
+            noise += [index] if entry.get("noise", False) else []
+        _unique(names, "coordinates", MOST_COORDINATES)
+        return names, units, noise
+
+    def _read_units(self, table: Table) -> tuple[fmpq, int | None, int | None]:
+        """Return r, and the coordinates f1 with ḟ1 = −r f1 and f2 = 1, from which bounds are made."""
+        rate, decaying, constant = fmpq(0), None, None
+        if table.get("decaying") is not None:
+            entry = mapping(table["decaying"], "decaying")
+            fields(entry, "decaying", {"coordinate", "rate"})
+            rate, decaying = rational(entry["rate"]), self._state(entry["coordinate"])
+        if table.get("constant") is not None:
+            constant = self._state(table["constant"])
+        if rate < 0 or (decaying is not None and decaying == constant):
+            raise RejectedError("decaying: a rate below 0, or the coordinate that is constant")
+        return rate, decaying, constant
+
+    def _index(self, name: object) -> int:
+        if not isinstance(name, str) or name not in self.coordinates:
+            raise RejectedError(f"no coordinate is named {str(name)[:40]!r}")
+        return self.coordinates.index(name)
+
+    def _state(self, name: object) -> int:
+        index = self._index(name)
+        if index in self.noise:
+            raise RejectedError(f"{name}: noise is no state")
+        return index
+
+    # Rows, facts and motions.
+
+    def _rows(self, rows: object, name: str) -> Matrix:
+        try:
+            return read_matrix(rows, None, self.size)
+        except RejectedError as error:
+            raise RejectedError(f"{name[:40]}: {error}") from None
+
+    def _fact(self, name: str, value: object) -> Matrix:
+        """Return Q of a fact zᵀQz ≤ 0."""
+        entry, total = mapping(value, name), zeros(self.size, self.size)
+        fields(entry, f"fact {name}", {"less", "more", "words"})
+        text_of(entry["words"], name)
+        for side, sign in (("less", 1), ("more", -1)):
+            for rows in _known(entry[side], self.rows, f"fact {name}"):
+                total += square(self.rows[rows]).times(fmpq(sign))
+        return total
+
+    def _motion(self, name: str, value: object) -> tuple[Corner, ...]:
+        corners = [self._corner(name, entry) for entry in entries(value, f"motion {name}")]
+        if not corners:
+            raise RejectedError(f"motion {name}: no corner")
+        kinds = {(c.input.height, *(u.along is not None for u in c.unknown)) for c in corners}
+        if len(kinds) > 1:
+            raise RejectedError(f"motion {name}: corners with different inputs or unknown signals")
+        return tuple(corners)
+
+    def _corner(self, name: str, entry: Table) -> Corner:
+        place = f"motion {name}"
+        fields(entry, place, {"matrix", "input", "unknown"})
+        F = read_matrix(entry["matrix"], self.size, self.size)
+        unknown = tuple(self._unknown(place, each) for each in entries(entry["unknown"], place))
+        for unit in self.units:
+            slope = {unit: -self.rate} if unit == self.decaying else {}
+            if not F.has_row(unit, slope):
+                raise RejectedError(f"{place}: {self.coordinates[unit]} does not move as a unit")
+        still = [*self.units, *self.noise]
+        if not F.is_zero(self.noise, range(self.size)):
+            raise RejectedError(f"{place}: noise has a motion")
+        if not all(each.column.is_zero(still, [0]) for each in unknown):
+            raise RejectedError(f"{place}: an unknown signal moves a unit or noise")
+        return Corner(F, read_matrix(entry["input"], None, self.size), unknown)
+
+    def _unknown(self, place: str, entry: Table) -> Unknown:
+        fields(entry, f"{place}, unknown", {"column", "rows"}, {"along", "least"})
+        if ("along" in entry) != ("least" in entry):
+            raise RejectedError(f"{place}: along and least belong together")
+        column = read_matrix(entry["column"], self.size, 1)
+        rows = read_matrix(entry["rows"], None, self.size)
+        if "along" not in entry:
+            return Unknown(column, rows, None, fmpq(0))
+        least = rational(entry["least"])
+        if least < 0:
+            raise RejectedError(f"{place}: least is below 0")
+        return Unknown(column, rows, read_matrix(entry["along"], 1, self.size), least)
+
+    # Locations, edges and the start.
+
+    def _location(self, entry: Table) -> Location:
+        name = name_of(entry.get("name"), "locations")
+        fields(entry, f"location {name}", {"name", "coordinates", "motion", "facts"}, {"clock"})
+        clock = None if entry.get("clock") is None else rational(entry["clock"])
+        if clock is not None and clock < 0:
+            raise RejectedError(f"location {name}: a clock below 0")
+        inside = {self._state(each) for each in strings(entry["coordinates"], f"location {name}")} | {
+            *self.units
+        }
+        (motion,) = _known([entry["motion"]], self.motions, f"location {name}")
+        facts = _known(entry["facts"], self.facts, f"location {name}")
+        outside = [i for i in self.states if i not in inside]
+        for corner in self.motions[motion]:
+            moved = corner.matrix.is_zero(outside, [*inside, *self.noise])
+            if not moved or not all(each.column.is_zero(outside, [0]) for each in corner.unknown):
+                raise RejectedError(f"location {name}: a coordinate that it lacks moves")
+        return Location(name, tuple(sorted(inside)), clock, self.motions[motion], facts)
+
+    def _edge(self, entry: Table) -> Edge:
+        name = name_of(entry.get("name"), "edges")
+        place = f"edge {name}"
+        fields(entry, place, {"name", "from", "to", "clock", "facts"}, {"when", "jump"})
+        (source,) = _known([entry["from"]], self.locations, place)
+        end = self.locations[source].clock
+        first, last = fmpq(0), end
+        if entry.get("when") is not None:
+            when = entry["when"]
+            if not isinstance(when, list) or len(when) != 2:
+                raise RejectedError(f"{place}: when has not two ends")
+            first, last = rational(when[0]), rational(when[1])
+            if not 0 <= first <= last or (end is not None and last > end):
+                raise RejectedError(f"{place}: when is not within the clock of {source}")
+        facts = _known(entry["facts"], self.facts, place)
+        if entry["clock"] not in ("zero", "keeps", "any"):
+            raise RejectedError(f"{place}: the clock is zero, keeps, or any")
+        if entry["to"] is None:
+            if "jump" in entry:
+                raise RejectedError(f"{place}: an edge that leads nowhere has no jump")
+            return Edge(
+                name, source, None, first, last, str(entry["clock"]), facts, zeros(self.size, self.size)
+            )
+        (target,) = _known([entry["to"]], self.locations, place)
+        jump = self._jump(place, entry.get("jump"), self.locations[source], self.locations[target])
+        return Edge(name, source, target, first, last, str(entry["clock"]), facts, jump)
+
+    def _jump(self, place: str, rows: object, source: Location, target: Location) -> Matrix:
+        J = read_matrix(rows, self.size, self.size)
+        outside = [i for i in self.states if i not in target.coordinates]
+        if not J.is_zero(outside, [*source.coordinates, *self.noise]):
+            raise RejectedError(f"{place}: a coordinate that {target.name} lacks is not 0 after it")
+        if not J.is_zero(self.noise, range(self.size)):
+            raise RejectedError(f"{place}: noise does not follow from a jump")
+        if not all(J.has_row(unit, {unit: fmpq(1)}) for unit in self.units):
+            raise RejectedError(f"{place}: a unit changes")
+        return J
+
+    def _read_start(self, value: object) -> None:
+        """Read z(0) = Z (1, p): a column, and one for each noise coordinate p."""
+        entry = mapping(value, "start")
+        fields(entry, "start", {"location", "columns", "facts"})
+        (self.start,) = _known([entry["location"]], self.locations, "start")
+        self.start_facts = _known(entry["facts"], self.facts, "start")
+        self.start_columns = Z = read_matrix(entry["columns"], self.size, 1 + len(self.noise))
+        outside = [i for i in self.states if i not in self.locations[self.start].coordinates]
+        if not Z.is_zero(outside, range(Z.width)):
+            raise RejectedError(f"start: a coordinate that {self.start} lacks is not 0")
+        if not all(Z.has_row(unit, {0: fmpq(1)}) for unit in self.units):
+            raise RejectedError("start: a unit is not 1")
+        if not all(Z.has_row(i, {1 + k: fmpq(1)}) for k, i in enumerate(self.noise)):
+            raise RejectedError("start: noise is not the column of its own")
+
+    # Outputs, limits and readings.
+
+    def _output(self, entry: Table) -> Output:
+        name = name_of(entry.get("name"), "outputs")
+        place = f"output {name}"
+        fields(entry, place, {"name", "unit", "in"}, {"rows", "velocity", "input"})
+        where = _known(entry["in"], self.locations, place)
+        if not where:
+            raise RejectedError(f"{place}: it is in no location")
+        unit = text_of(entry["unit"], place)
+        if "input" in entry:
+            index = whole(entry["input"])
+            inputs = min(self.locations[each].motion[0].input.height for each in where)
+            if "rows" in entry or "velocity" in entry or index >= inputs:
+                raise RejectedError(f"{place}: not an entry of the input")
+            return Output(name, unit, None, None, index, where)
+        rows = self._rows(entry.get("rows"), place)
+        velocity = None if "velocity" not in entry else read_matrix(entry["velocity"], rows.height, self.size)
+        return Output(name, unit, rows, velocity, None, where)
+
+    def _limit(self, entry: Table) -> Limit:
+        """Read a limit; its output is one of all locations, and is continuous but for edges."""
+        fields(entry, "while", {"output", "less"})
+        (name,) = _known([entry["output"]], self.outputs, "while")
+        less = rational(entry["less"])
+        if less <= 0 or {*self.outputs[name].locations} != {*self.locations}:
+            raise RejectedError(f"while {name}: not above 0, or the output is not one of all locations")
+        if self.outputs[name].velocity is not None:
+            raise RejectedError(f"while {name}: a velocity may jump at any time")
+        return Limit(name, less)
+
+    def _read_reading(self, name: str, value: object) -> None:
+        """Read what a recorded column shows of z. Only a comparison with runs uses it."""
+        for entry in entries(value, f"reading {name}"):
+            fields(entry, f"reading {name}", {"rows", "in"})
+            self._rows(entry["rows"], f"reading {name}")
+            _known(entry["in"], self.locations, f"reading {name}")
+
+
+# Reading.
+
+
+def read_table(text: str, expected: str) -> Table:
+    """Return the table in a JSON text: exact numbers, no key twice, of the expected format.
+
+    Raises:
+        RejectedError: it is none.
+    """
+    if len(text) > MOST_BYTES:
+        raise RejectedError(f"larger than {MOST_BYTES // 2**20} MiB")
+    try:
+        table = json.loads(
+            text,
+            parse_float=decimal,
+            parse_int=decimal,
+            parse_constant=lambda name: decimal(str(name)),
+            object_pairs_hook=_once,
+        )
+    except RecursionError:
+        raise RejectedError("nested too deeply") from None
+    except json.JSONDecodeError as error:
+        raise RejectedError(f"not JSON: {error}") from None
+    if not isinstance(table, dict) or table.get("format") != expected:
+        raise RejectedError(f'not a file of the format "{expected}"')
+    return table
+
+
+def _once(pairs: Sequence[tuple[str, object]]) -> dict[str, object]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        raise RejectedError("a key occurs twice")
+    return table
+
+
+def fields(table: Table, place: str, required: set[str], optional: set[str] = frozenset()) -> None:  # type: ignore[assignment]
+    """Require a table's keys to be those that it must have, and perhaps those that it may have."""
+    if missing := sorted(required - {*table}):
+        raise RejectedError(f"{place}: {missing[0]} is missing")
+    if unknown := sorted({*table} - required - optional):
+        raise RejectedError(f"{place}: unknown key {unknown[0][:40]!r}")
+
+
+def mapping(value: object, place: str) -> Table:
+    """Return a table."""
+    if not isinstance(value, dict):
+        raise RejectedError(f"{place[:80]}: not a table")
+    return value
+
+
+def entries(value: object, place: str) -> list[Table]:
+    """Return a list of tables."""
+    if not isinstance(value, list):
+        raise RejectedError(f"{place[:80]}: not a list")
+    return [mapping(each, place) for each in value]
+
+
+def strings(value: object, place: str) -> list[str]:
+    """Return a list of strings."""
+    if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
+        raise RejectedError(f"{place[:80]}: not a list of names")
+    return value
+
+
+def text_of(value: object, place: str) -> str:
+    """Return a printable text, perhaps empty."""
+    if not isinstance(value, str) or not value.isprintable() or len(value) > MOST_NAME:
+        raise RejectedError(f"{place[:80]}: not a printable text of at most {MOST_NAME} characters")
+    return value
+
+
+def name_of(value: object, place: str) -> str:
+    """Return a name."""
+    if not text_of(value, place):
+        raise RejectedError(f"{place[:80]}: a name is empty")
+    return str(value)
+
+
+def _known(value: object, names: Iterable[str], place: str) -> tuple[str, ...]:
+    """Return names, all of which are known, each once."""
+    found, known = strings(value, place), {*names}
+    if unknown := [each for each in found if each not in known]:
+        raise RejectedError(f"{place[:80]}: unknown name {unknown[0][:40]!r}")
+    _unique(found, place)
+    return tuple(found)
+
+
+def _unique(names: Sequence[str], place: str, most: int | None = None) -> None:
+    if len({*names}) < len(names):
+        raise RejectedError(f"{place[:80]}: a name occurs twice")
+    if most is not None and len(names) > most:
+        raise RejectedError(f"{place[:80]}: more than {most}")

@@ -1,0 +1,196 @@
+"""Exact numbers, matrices of intervals, and the test that a symmetric matrix is positive semidefinite.
+
+All arithmetic is rational, so that terms that should cancel do cancel. Only the last step of a test, LDLᵀ,
+is computed in balls: a midpoint of 128 bits with a radius that contains the true value.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+
+from flint import arb, ctx, fmpq, fmpq_mat
+
+ctx.prec = 128  # bits of a ball's midpoint
+
+MOST_DIGITS = 400
+"""Most characters of a number, and largest exponent of a decimal."""
+_DECIMAL = re.compile(r"(-?)([0-9]+)(?:\.([0-9]+))?(?:[eE]([+-]?[0-9]+))?")
+_QUOTIENT = re.compile(r"(-?[0-9]+)/([0-9]+)")
+
+
+class RejectedError(ValueError):
+    """The document is malformed, or the proof does not prove its bound; the message says where."""
+
+
+def decimal(text: str) -> fmpq:
+    """Return the exact value of a decimal such as ``-2.5e-3``."""
+    match = _DECIMAL.fullmatch(text)
+    if match is None or len(text) > MOST_DIGITS or abs(power := int(match[4] or 0)) > MOST_DIGITS:
+        raise RejectedError(f"not a number, or too long: {text[:40]}")
+    digits, places = int(match[2] + (match[3] or "")), len(match[3] or "")
+    value = fmpq(digits, 10**places) * (fmpq(10**power) if power >= 0 else fmpq(1, 10**-power))
+    return -value if match[1] else value
+
+
+def rational(value: object) -> fmpq:
+    """Return an exact number of a file: a decimal, as :func:`decimal` has read it, or a string "p/q"."""
+    if isinstance(value, fmpq):
+        return value
+    match = _QUOTIENT.fullmatch(value) if isinstance(value, str) and len(value) <= 2 * MOST_DIGITS else None
+    if match is None or int(match[2]) == 0:
+        raise RejectedError(f"not a number: {str(value)[:40]!r}")
+    return fmpq(int(match[1]), int(match[2]))
+
+
+def whole(value: object) -> int:
+    """Return a whole number ≥ 0 of a file."""
+    found = rational(value)
+    if found.q != 1 or found < 0:
+        raise RejectedError(f"not a whole number: {found}")
+    return int(found.p)
+
+
+class Matrix:
+    """All matrices whose entries are within ``radius`` of ``mid``, both exact. The radius None is 0."""
+
+    def __init__(self, mid: fmpq_mat, radius: fmpq_mat | None = None) -> None:
+        self.mid, self.radius = mid, radius
+
+    @property
+    def height(self) -> int:
+        """The number of rows."""
+        return int(self.mid.nrows())
+
+    @property
+    def width(self) -> int:
+        """The number of columns."""
+        return int(self.mid.ncols())
+
+    def __add__(self, other: "Matrix") -> "Matrix":
+        radius = other.radius if self.radius is None else self.radius
+        if self.radius is not None and other.radius is not None:
+            radius = self.radius + other.radius
+        return Matrix(self.mid + other.mid, radius)
+
+    def __sub__(self, other: "Matrix") -> "Matrix":
+        return self + other.times(fmpq(-1))
+
+    def __matmul__(self, other: "Matrix") -> "Matrix":
+        radius = None if other.radius is None else _sizes(self.mid) * other.radius
+        if self.radius is not None:
+            largest = _sizes(other.mid) if other.radius is None else _sizes(other.mid) + other.radius
+            radius = self.radius * largest if radius is None else radius + self.radius * largest
+        return Matrix(self.mid * other.mid, radius)
+
+    def times(self, factor: fmpq) -> "Matrix":
+        """Return a multiple."""
+        return Matrix(self.mid * factor, None if self.radius is None else self.radius * abs(factor))
+
+    @property
+    def T(self) -> "Matrix":
+        """The transposed matrix."""
+        return Matrix(self.mid.transpose(), None if self.radius is None else self.radius.transpose())
+
+    def take(self, rows: Sequence[int], columns: Sequence[int]) -> "Matrix":
+        """Return some rows and columns."""
+        places = [(i, j) for i in rows for j in columns]
+        mid = fmpq_mat(len(rows), len(columns), [self.mid[place] for place in places])
+        if self.radius is None:
+            return Matrix(mid)
+        return Matrix(mid, fmpq_mat(len(rows), len(columns), [self.radius[place] for place in places]))
+
+    def is_zero(self, rows: Iterable[int], columns: Sequence[int]) -> bool:
+        """Return whether entries are 0, exactly."""
+        places = [(i, j) for i in rows for j in columns]
+        return all(M is None or all(M[place] == 0 for place in places) for M in (self.mid, self.radius))
+
+    def has_row(self, index: int, entries: dict[int, fmpq]) -> bool:
+        """Return whether a row has these entries, exactly, and 0 elsewhere."""
+        columns = range(self.width)
+        if self.radius is not None and any(self.radius[index, j] != 0 for j in columns):
+            return False
+        return all(self.mid[index, j] == entries.get(j, 0) for j in columns)
+
+
+def _sizes(M: fmpq_mat) -> fmpq_mat:
+    return fmpq_mat(M.nrows(), M.ncols(), [abs(entry) for entry in M.entries()])
+
+
+def zeros(height: int, width: int) -> Matrix:
+    """Return a matrix of zeros."""
+    return Matrix(fmpq_mat(height, width))
+
+
+def unit_rows(indices: Sequence[int], width: int) -> Matrix:
+    """Return one row for each index, with a 1 at this index."""
+    found = fmpq_mat(len(indices), width)
+    for row, index in enumerate(indices):
+        found[row, index] = fmpq(1)
+    return Matrix(found)
+
+
+def beside(left: Matrix, right: Matrix) -> Matrix:
+    """Return two matrices with equally many rows, one beside the other."""
+    columns, more = range(left.width), range(right.width)
+    at_left = unit_rows(columns, left.width + right.width)
+    at_right = unit_rows([left.width + j for j in more], left.width + right.width)
+    return left @ at_left + right @ at_right
+
+
+def square(rows: Matrix) -> Matrix:
+    """Return RᵀR, the matrix of the quadratic form |Rz|²."""
+    return rows.T @ rows
+
+
+def product(left: Matrix, right: Matrix) -> Matrix:
+    """Return LᵀR + RᵀL, the matrix of the quadratic form 2 (Lz)ᵀ(Rz)."""
+    half = left.T @ right
+    return half + half.T
+
+
+def read_matrix(rows: object, height: int | None, width: int) -> Matrix:
+    """Return a matrix of a file; an entry is a number, or an interval [low, high].
+
+    Args:
+        rows: as the file has them.
+        height: the number of rows; None: any.
+        width: the number of columns.
+    """
+    if not isinstance(rows, list) or (height is not None and len(rows) != height):
+        raise RejectedError(f"not a matrix of {height} rows")
+    if any(not isinstance(row, list) or len(row) != width for row in rows):
+        raise RejectedError(f"a row has not {width} entries")
+    mid, radius = fmpq_mat(len(rows), width), None
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            if not isinstance(entry, list):
+                mid[i, j] = rational(entry)
+                continue
+            if len(entry) != 2 or not rational(entry[0]) <= rational(entry[1]):
+                raise RejectedError("an interval has not two ends in their order")
+            low, high = map(rational, entry)
+            radius = fmpq_mat(len(rows), width) if radius is None else radius
+            mid[i, j], radius[i, j] = (low + high) / 2, (high - low) / 2
+    return Matrix(mid, radius)
+
+
+def is_positive(M: Matrix) -> bool:
+    """Return whether all symmetric matrices in M are proven positive semidefinite.
+
+    LDLᵀ in balls has positive pivots. Rows and columns of exact zeros are left out before it.
+    """
+    size = range(M.height)
+    kept = [i for i in size if not (M.is_zero([i], size) and M.is_zero(size, [i]))]
+    rest = [[_ball(M, i, j) for j in kept] for i in kept]
+    for k, pivots in enumerate(rest):
+        if not pivots[k] > 0:
+            return False
+        for i in range(k + 1, len(kept)):
+            factor = pivots[i] / pivots[k]
+            for j in range(i, len(kept)):
+                rest[i][j] -= factor * pivots[j]
+    return True
+
+
+def _ball(M: Matrix, i: int, j: int) -> arb:
+    mid = arb((M.mid[i, j] + M.mid[j, i]) / 2)
+    return mid if M.radius is None else mid + arb(0, arb(max(M.radius[i, j], M.radius[j, i])).upper())

@@ -1,0 +1,445 @@
+"""The loop document of a loop: coordinates, facts, motions, locations and edges, as the kernel reads them.
+
+A document says nothing of a trigger or a network: losses are locations, deliveries are edges, a threshold is
+a fact. It has the form of ``noack_check.model``, in which the search finds its proofs.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+from flint import arb, arb_mat, fmpq
+
+from noack.proof.numbers import Number, entry, exact, least_above, matrix, quotient, to_fraction
+from noack_check.balls import columns_of, identity, is_zero, rows_of
+from noack_check.loop import Loop
+from noack_check.model import Edge, Flow, Location, Model, Unknown
+from noack_check.proof import Assumptions
+
+FORMAT = "noack-hybrid 1"
+Table = dict[str, Any]
+_ALL = {
+    "x": "all states",
+    "e_s": "error of the sensor's model",
+    "e_c": "error of the controller's model",
+    "drift": "growth of the sensor's error",
+}
+"""Names of outputs with several rows."""
+
+
+class NoDocumentError(ValueError):
+    """A loop that no document describes yet; the message says why."""
+
+
+@dataclass(frozen=True)
+class Naming:
+    """How a document names a loop.
+
+    Attributes:
+        loop: the document's name.
+        states: names of the states; those that are missing have numbers.
+        outputs: names of the outputs.
+        units: by the name of a state or output, its unit.
+    """
+
+    loop: str
+    states: Sequence[str] = ()
+    outputs: Sequence[str] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def state(self, index: int) -> str:
+        """Return the name of a state."""
+        return self.states[index] if index < len(self.states) else f"x{index}"
+
+    def output(self, name: str) -> str:
+        """Return the name of an output that the search calls "y[0]"."""
+        if name.startswith("y["):
+            index = int(name[2:-1])
+            return self.outputs[index] if index < len(self.outputs) else f"output {index}"
+        if name.startswith("x["):
+            return f"state {self.state(int(name[2:-1]))}"
+        if name.startswith("u["):
+            return f"input {name[2:-1]}"
+        return _ALL.get(name, name)
+
+
+class LoopDocument:
+    """The document of a loop, and what a proof needs of it.
+
+    Args:
+        loop: the loop.
+        rate: r in f1 = e^{−rt}, 1/s.
+        assumed: what the model assumes; it becomes facts of the document.
+        outputs: names of what is bounded, as the search has them.
+        naming: of the loop.
+
+    Raises:
+        NoDocumentError: the document has no words for the loop.
+    """
+
+    def __init__(
+        self, loop: Loop, rate: arb, assumed: Assumptions, outputs: Iterable[str], naming: Naming
+    ) -> None:
+        if loop.rule.memory is not None:
+            raise NoDocumentError("a rule with a dynamic variable has no loop document")
+        if loop.rule.integrates:
+            raise NoDocumentError("a rule that integrates has no loop document")
+        self.loop, self.rate, self._assumed, self.naming = loop, rate, assumed, naming
+        self.model = Model(loop, rate, arb(0), assumed.errors, assumed.noise, **assumed.of_model)
+        used = {c for place in self.model.locations for c in place.coordinates} | {*self.model.sources}
+        self.used = sorted(used)
+        self._select = columns_of(identity(self.model.size), self.used)
+        self.labels = self._labels()
+        self.rows: Table = {}
+        self.facts: dict[str, Table] = {}
+        self._named: dict[tuple[object, ...], str] = {}
+        """Names of facts by the symmetric matrix that the model has for them."""
+        self._name_facts()
+        self.motions: dict[str, list[Table]] = {}
+        self._motion_names: dict[int, str] = {}
+        self.location_facts = [[self.fact(Q) for Q in (*p.silent, *p.facts)] for p in self.model.locations]
+        self.clocks = [self._clock(place, index) for index, place in enumerate(self.model.locations)]
+        locations = [self._location(index) for index in range(len(self.model.locations))]
+        self.edge_names = self._edge_names()
+        edges = [self._edge(edge, name) for edge, name in self.edges]
+        self.output_names = self._output_names([*dict.fromkeys(outputs)])
+        self.outputs = [self._output(name) for name in self.output_names]
+        self.table: Table = {
+            "format": FORMAT,
+            "name": naming.loop,
+            "about": self._about(),
+            "coordinates": [self._coordinate(index) for index in self.used],
+            "rows": self.rows,
+            "facts": self.facts,
+            "motions": self.motions,
+            "locations": locations,
+            "edges": [*edges, *self._silent_edges()],
+            "start": self._start(),
+            "outputs": self.outputs,
+        }
+        if self._has("f1"):
+            self.table["decaying"] = {"coordinate": "f1", "rate": exact(rate)}
+        if self._has("f2"):
+            self.table["constant"] = "f2"
+        if loop.region is not None:
+            self.table["while"] = [*self._limits()]
+
+    # Coordinates.
+
+    def _labels(self) -> dict[int, str]:
+        """Return the name of each coordinate of the model."""
+        model, n, found = self.model, self.loop.n, dict[int, str]()
+        parts = [("", model.x), ("e ", model.error_rows[0]), ("w ", model.error_rows[1])]
+        parts += [(f"v{k} ", rows) for k, rows in enumerate(model.error_rows[2:], 1)]
+        for prefix, rows in parts:
+            for i in range(rows.nrows()):
+                name = self.naming.state(i) if rows.nrows() == n else f"entry {i}"
+                found |= {c: prefix + name for c in range(model.size) if rows[i, c] != 0}
+        for kind, rows in (("s", model.s), ("n", model.p)):
+            found |= {
+                c: f"{kind}{i}" for i in range(rows.nrows()) for c in range(model.size) if rows[i, c] != 0
+            }
+        found[model.size - 2], found[model.size - 1] = "f1", "f2"
+        return found
+
+    def _coordinate(self, index: int) -> Table:
+        name = self.labels[index]
+        state = name.removeprefix("e ").removeprefix("w ").split(" ", 1)[-1] if name[0] == "v" else name
+        unit = self.naming.units.get(state.removeprefix("e ").removeprefix("w "), "")
+        is_noise = index in self.model.sources
+        return {"name": name, "unit": unit} | ({"noise": True} if is_noise else {})
+
+    def _has(self, unit: str) -> bool:
+        return any(self.labels[index] == unit for index in self.used)
+
+    def _about(self) -> str:
+        """Return what the names of coordinates and locations mean."""
+        model, parts = self.model, []
+        prefixes = {self.labels[c].split(" ")[0] for c in self.used}
+        parts.append("e is x_s − x, the error of the sensor's model")
+        parts.append("w is x_c − x_s, where the acting input was computed from x_c")
+        if "v1" in prefixes:
+            parts.append("v1, v2, ... are what w will be when a later update acts, the newest one first")
+        if model.s.nrows():
+            parts.append(
+                "s0, s1, ... are errors of the estimate that no noise causes; the rows of e are without them"
+            )
+        if model.sources:
+            parts.append("n0, n1, ... are the noise of a measurement")
+        parts.append('"j lost": j updates were sent since the one that acts, and all are lost')
+        if any("later" in place.name for place in model.locations):
+            parts.append('"k later": an update is on its way, and k were sent after it')
+        return ". ".join(parts) + "."
+
+    def columns(self, rows: arb_mat) -> list[list[Number | list[float]]]:
+        """Return rows of the document's coordinates."""
+        return matrix(rows * self._select)
+
+    # Facts.
+
+    def _name_facts(self) -> None:
+        model, rule = self.model, self.loop.rule
+        if rule.positive.nrows():
+            self.rows["compared"] = self.columns(rule.positive * model.pair)
+        if rule.negative.nrows():
+            self.rows["share"] = self.columns(rule.negative * model.pair)
+        for name, row in (("f1", model.f1), ("f2", model.f2)):
+            if self._has(name):
+                self.rows[name] = self.columns(row)
+        for name, size, unit in (("level", model.level, "f1"), ("floor", model.floor, "f2")):
+            if size > 0 and self._has(unit):
+                self.rows[name] = self._multiple(unit, size)
+        sizes: list[str] = [name for name in ("share", "level", "floor") if name in self.rows]
+        if "compared" in self.rows:
+            words = "no event: the comparison is at most the threshold"
+            self._add_fact("silent", ["compared"], sizes, words, model.silent)
+        for guard, Q in model.guards.items():
+            kept = {"c1": ["share", "level"], "c2": ["share", "floor"], "": ["share", "floor"]}[guard]
+            name = {"c1": "event, level", "c2": "event, floor", "": "event"}[guard]
+            words = "an event: the comparison is at least the threshold"
+            self._add_fact(name, [size for size in kept if size in sizes], ["compared"], words, Q)
+        if self._has_plain_terms:
+            self._add_plain_rows()
+        for k, (source, Q) in enumerate(zip(model.sources, model.noise_bounds, strict=True)):
+            unit = "f1" if k < model.bounds.decaying else "f2"
+            name = self.labels[source]
+            self.rows[name] = [[int(c == source) for c in self.used]]
+            self._add_fact(f"noise {name}", [name], [unit], "bound of the noise of a measurement", Q)
+        if model.errors is not None:
+            self._add_assumed()
+
+    @property
+    def _has_plain_terms(self) -> bool:
+        """Whether forms have terms of a comparison without its noise."""
+        return bool(self.model.sources) and "compared" in self.rows
+
+    def _add_plain_rows(self) -> None:
+        for name in ("compared", "share"):
+            if name in self.rows:
+                noisy = {self.used.index(c) for c in self.model.sources}
+                rows = [[0 if j in noisy else v for j, v in enumerate(row)] for row in self.rows[name]]
+                self.rows[f"{name} without noise"] = rows
+
+    def _add_assumed(self) -> None:
+        """Add bounds of e and w that another argument proves by induction over the events."""
+        model, errors = self.model, self.model.errors
+        assert errors is not None
+        pairs: dict[str, tuple[arb_mat, arb]] = {"e": (model.e, arb(1))}
+        for lost in range(self.loop.losses + 1):
+            for sent in range(self._assumed.later + 2):
+                if lost + sent:
+                    pairs[f"w, {lost} lost, {sent} recent"] = model.w, errors.chain.factor(lost, sent)
+        wanted = {_key(Q) for place in model.locations for Q in place.facts}
+        for name, (error, factor) in pairs.items():
+            Q = model.at_most(error, factor)[0]
+            if _key(Q) not in wanted or _key(Q) in self._named:
+                continue
+            self.rows[name] = self.columns(self.loop.weight * error)
+            limits = [
+                self._multiple(unit, factor * size)[0]
+                for unit, size in (("f1", errors.decaying), ("f2", errors.constant))
+                if self._has(unit)
+            ]
+            self.rows[f"limit of {name}"] = limits
+            words = "assumed here, and proven by induction over the events"
+            self._add_fact(f"bound of {name}", [name], [f"limit of {name}"], words, Q)
+
+    def _multiple(self, unit: str, size: arb) -> list[list[Number]]:
+        return [[least_above(size) if self.labels[c] == unit else 0 for c in self.used]]
+
+    def _add_fact(self, name: str, less: list[str], more: list[str], words: str, Q: arb_mat) -> None:
+        self.facts[name] = {"less": less, "more": more, "words": words}
+        self._named.setdefault(_key(Q), name)
+
+    def fact(self, Q: arb_mat) -> str:
+        """Return the name of a fact of the model."""
+        if (name := self._named.get(_key(Q))) is None:
+            raise NoDocumentError("the model has a fact that the document has no words for")
+        return name
+
+    # Motions and locations.
+
+    def _motion(self, flows: tuple[Flow, ...]) -> str:
+        if id(flows) not in self._motion_names:
+            name = "driven" if any(not is_zero(flow.input) for flow in flows) else "without input"
+            name = name if name not in self.motions else f"{name} {len(self.motions)}"
+            self._motion_names[id(flows)] = name
+            self.motions[name] = [self._corner(flow) for flow in flows]
+        return self._motion_names[id(flows)]
+
+    def _corner(self, flow: Flow) -> Table:
+        signals = [signal.plain for signal in self.model.signals(flow.input)]
+        others = flow.unknowns[len(signals) :]
+        return {
+            "matrix": self._square(flow.matrix),
+            "input": self.columns(flow.input),
+            "unknown": [self._unknown(each) for each in (*signals, *others)],
+        }
+
+    def _square(self, M: arb_mat) -> list[list[Number | list[float]]]:
+        return matrix(rows_of(M * self._select, self.used))
+
+    def _unknown(self, unknown: Unknown) -> Table:
+        column = [[entry(unknown.column[c, 0])] for c in self.used]
+        found: Table = {"column": column, "rows": self.columns(unknown.rows)}
+        if unknown.along is not None:
+            found |= {
+                "along": self.columns(unknown.along.row),
+                "least": quotient(_lower(unknown.along.least)),
+            }
+        return found
+
+    def _location(self, index: int) -> Table:
+        place, clock = self.model.locations[index], self.clocks[index]
+        units = (self.model.size - 2, self.model.size - 1)
+        found: Table = {
+            "name": place.name,
+            "coordinates": [self.labels[c] for c in place.coordinates if c not in units],
+            "motion": self._motion(place.flows),
+            "facts": self.location_facts[index],
+        }
+        return found if clock is None else found | {"clock": exact(clock)}
+
+    def _clock(self, place: Location, index: int) -> fmpq | None:
+        """Return the largest time since the last test, since an update was sent, or since the last event."""
+        model, times = self.model, self.loop.times
+        if model.is_by_tests:
+            return model.clock_of_place(index)
+        until = times.start if place.name.startswith("start") else times.delay
+        if model.is_periodic:
+            if place.is_tested:
+                return times.period
+            return min(until - _later(place.name) * times.least_period, times.period)
+        if place.is_tested:
+            return times.sampling if times.sampling > 0 else None
+        return until
+
+    # Edges.
+
+    def _edge_names(self) -> list[str]:
+        names: list[str] = []
+        for edge in self.model.edges:
+            target = self.model.locations[edge.target].name
+            names.append(edge.name if edge.name not in names else f"{edge.name} to {target}")
+        return names
+
+    @property
+    def edges(self) -> list[tuple[Edge, str]]:
+        """Edges of the model that are possible, with their names."""
+        pairs = zip(self.model.edges, self.edge_names, strict=True)
+        return [(edge, name) for edge, name in pairs if self._when(edge)[0] <= self._when(edge)[1]]
+
+    def _when(self, edge: Edge) -> tuple[fmpq, fmpq]:
+        end, least = self.clocks[edge.source] or fmpq(0), fmpq(0)
+        if self.model.is_by_tests and edge.is_test:
+            return end, end
+        if self.model.is_periodic and edge.is_test:
+            least = self.loop.times.least_period
+        return least, end
+
+    def _clock_after(self, edge: Edge) -> str:
+        if self.model.is_by_tests:
+            return "zero" if edge.is_test else "keeps"
+        waits = not self.model.locations[edge.source].is_tested
+        if edge.is_test:
+            return "keeps" if waits and not self.model.is_periodic else "zero"
+        return "keeps" if self.model.is_periodic else "any"
+
+    def facts_of(self, edge: Edge) -> list[str]:
+        """Return the names of an edge's facts."""
+        return [self.fact(Q) for Q in edge.facts]
+
+    def _edge(self, edge: Edge, name: str) -> Table:
+        source, target = self.model.locations[edge.source], self.model.locations[edge.target]
+        found: Table = {"name": name, "from": source.name, "to": target.name}
+        if self.clocks[edge.source] is not None:
+            found["when"] = [exact(end) for end in self._when(edge)]
+        jump = self._square(edge.jump)
+        for row, c in enumerate(self.used):
+            if c not in target.coordinates:  # also of noise, which does not follow from a jump
+                jump[row] = [0] * len(self.used)
+        return found | {"clock": self._clock_after(edge), "facts": self.facts_of(edge), "jump": jump}
+
+    def _silent_edges(self) -> Iterator[Table]:
+        """Yield a test without an event for each location that has none: it sets the clock to 0."""
+        for index in self.silent_locations:
+            name = self.model.locations[index].name
+            noise = [self.fact(Q) for Q in self.model.noise_bounds]
+            yield {
+                "name": f"{name}, silent",
+                "from": name,
+                "to": name,
+                "when": [0, exact(self.clocks[index] or fmpq(0))],
+                "clock": "zero",
+                "facts": (["silent"] if "silent" in self.facts else []) + noise,
+                "jump": [[int(c == d and c not in self.model.sources) for d in self.used] for c in self.used],
+            }
+
+    @property
+    def silent_locations(self) -> list[int]:
+        """Locations with tests whose silent ones the model need not show."""
+        if self.model.is_by_tests or self.model.is_periodic or not self.loop.times.sampling > 0:
+            return []
+        present = {edge.source for edge in self.model.edges if edge.name.endswith(", silent")}
+        tested = [i for i, place in enumerate(self.model.locations) if place.is_tested]
+        return [index for index in tested if index not in present]
+
+    def _start(self) -> Table:
+        model = self.model
+        columns = matrix(rows_of(model.start_columns, self.used))
+        facts = [self.fact(Q) for Q in model.noise_bounds]
+        location = model.locations[model.start_location].name
+        return {"location": location, "columns": columns, "facts": facts}
+
+    # Outputs and limits.
+
+    def _output_names(self, outputs: Sequence[str]) -> dict[str, str]:
+        """Return the document's name of each output; a name that is taken has a number."""
+        found: dict[str, str] = {}
+        for name in outputs:
+            label = self.naming.output(name)
+            taken = [*found.values()].count(label)
+            found[name] = f"{label} ({taken + 1})" if taken else label
+        return found
+
+    def _output(self, name: str) -> Table:
+        model, places = self.model, [place.name for place in self.model.locations]
+        label = self.output_names[name]
+        found: Table = {"name": label, "unit": self.naming.units.get(label, ""), "in": places}
+        if name.startswith("u["):
+            return found | {"input": int(name[2:-1])}
+        if name == "drift":
+            loop = self.loop
+            where = [place for place in places if not place.startswith("start")]
+            rows = -1 * (loop.weight * loop.H * model.x)
+            velocity = self.columns(loop.weight * model.x)
+            return found | {"in": where, "rows": self.columns(rows), "velocity": velocity}
+        return found | {"rows": self.columns(model.output(name, model.locations[0])[0][0])}
+
+    def _limits(self) -> Iterator[Table]:
+        """Yield the limits of a region; each is one of an output that is bounded."""
+        region, names = self.loop.region, self.output_names
+        assert region is not None
+        for kind, limits in zip("xu", region, strict=True):
+            for index, limit in enumerate(limits):
+                if limit is None:
+                    continue
+                name = f"{kind}[{index}]"
+                if name not in names:
+                    raise NoDocumentError(f"the limit of {self.naming.output(name)} has no bound by forms")
+                yield {"output": names[name], "less": quotient(_lower(limit))}
+
+
+def _later(name: str) -> int:
+    """Return k of a location "k later" or "start, k later"."""
+    return int(name.removeprefix("start, ").split(" ")[0])
+
+
+def _key(Q: arb_mat) -> tuple[object, ...]:
+    """Return what is equal for matrices that are the same, balls included."""
+    return tuple((v.mid().man_exp(), v.rad().man_exp()) for v in Q.entries())
+
+
+def _lower(value: arb) -> Fraction:
+    return to_fraction(value.lower())

@@ -1,0 +1,97 @@
+"""Numbers of a file, as JSON has them: decimals, quotients "p/q", and intervals that are rounded outwards."""
+
+import math
+from fractions import Fraction
+
+from flint import arb, arb_mat, fmpq
+
+_MOST_DENOMINATOR = 10**12
+Number = int | float | str
+
+
+def exact(value: arb | fmpq | float | int) -> Number:
+    """Return an exact number.
+
+    A number that is a double is written as its shortest decimal, as a scenario has it. The decimal may
+    differ from the double by half a unit in the last place, and is what the document says.
+    """
+    fraction = to_fraction(value)
+    if fraction.denominator == 1:
+        return int(fraction)
+    try:
+        nearest = float(fraction)
+    except OverflowError:
+        return f"{fraction.numerator}/{fraction.denominator}"
+    if Fraction(repr(nearest)) == fraction or Fraction(nearest) == fraction:
+        return nearest
+    return f"{fraction.numerator}/{fraction.denominator}"
+
+
+def entry(value: arb | fmpq) -> Number | list[float]:
+    """Return an exact number, or the interval of a ball, rounded outwards."""
+    if not isinstance(value, arb) or value.is_exact():
+        return exact(value)
+    low, high = (to_fraction(end) for end in (value.lower(), value.upper()))
+    return [below(low), above(high)]
+
+
+def above(value: Fraction) -> float:
+    """Return a float whose decimal is at least a value."""
+    found = float(value)
+    while Fraction(repr(found)) < value:
+        found = math.nextafter(found, math.inf)
+    return found
+
+
+def below(value: Fraction) -> float:
+    """Return a float whose decimal is at most a value."""
+    return -above(-value)
+
+
+def least_above(value: arb) -> float:
+    """Return a float whose decimal is at least all numbers of a ball."""
+    return above(to_fraction(value.upper()))
+
+
+def to_fraction(value: arb | fmpq | float | int) -> Fraction:
+    """Return an exact number as a fraction.
+
+    Raises:
+        ValueError: it is a ball.
+    """
+    if isinstance(value, arb):
+        if not value.is_exact():
+            raise ValueError("a ball is no exact number")
+        value = value.fmpq()
+    if isinstance(value, fmpq):
+        return Fraction(int(value.p), int(value.q))
+    return Fraction(value)
+
+
+def simplest(value: arb) -> Fraction:
+    """Return the fraction with a small denominator that a narrow ball stands for.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if value.is_exact():
+        return to_fraction(value)
+    found = to_fraction(value.mid()).limit_denominator(_MOST_DENOMINATOR)
+    if not value.contains(arb(fmpq(found.numerator, found.denominator))):
+        raise ValueError(f"no fraction with a small denominator is in {value}")
+    return found
+
+
+def as_written(value: float) -> Fraction:
+    """Return the decimal of a float, as a file has it."""
+    return Fraction(repr(value))
+
+
+def quotient(value: Fraction) -> Number:
+    """Return a fraction, as a decimal where it has a short one."""
+    return exact(fmpq(value.numerator, value.denominator))
+
+
+def matrix(M: arb_mat) -> list[list[Number | list[float]]]:
+    """Return a matrix."""
+    return [[entry(M[i, j]) for j in range(M.ncols())] for i in range(M.nrows())]

@@ -1,0 +1,178 @@
+"""A loop document as text: the page that says what a proof is about."""
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from typing import Any
+
+_WIDTH = 108
+_DIGITS = 4
+_MS = 1000
+_CLOCKS = {"zero": "the clock is set to 0", "keeps": "the clock goes on", "any": "the clock may be any"}
+Table = Mapping[str, Any]
+
+
+def in_words(document: Table) -> str:
+    """Return the text of a loop document.
+
+    Args:
+        document: its table, as :class:`.loop_document.LoopDocument` has it or JSON reads it.
+
+    Example:
+        >>> print(in_words(json.loads(Path("pendulum.loop.json").read_text())))  # doctest: +SKIP
+    """
+    return "\n".join(_lines(document))
+
+
+def _lines(document: Table) -> Iterator[str]:
+    names = [coordinate["name"] for coordinate in document["coordinates"]]
+    yield f"# Loop document: {document['name']}"
+    yield ""
+    yield from _wrapped("z = ", [_with_unit(c) for c in document["coordinates"]], ", ")
+    if "about" in document:
+        yield from _wrapped(document["about"], [], "")
+    noise = [c["name"] for c in document["coordinates"] if c.get("noise")]
+    if noise:
+        yield from _wrapped("Noise, any value at each moment that the facts allow: ", noise, ", ")
+    units = []
+    if document.get("decaying"):
+        rate = _number(document["decaying"]["rate"])
+        units.append(f"{document['decaying']['coordinate']} = e^(−{rate} t)")
+    if document.get("constant"):
+        units.append(f"{document['constant']} = 1")
+    yield f"Units of the bounds: {', '.join(units)}."
+    yield from ("", "## Facts: Σ|left|² ≤ Σ|right|²")
+    used = {name for fact in document["facts"].values() for name in (*fact["less"], *fact["more"])}
+    for name, fact in document["facts"].items():
+        left, right = (" + ".join(f"|{each}|²" for each in fact[side]) or "0" for side in ("less", "more"))
+        yield from _wrapped(f"- {name}: {left} ≤ {right} ({fact['words']})", [], "")
+    for name in sorted(used & {*document["rows"]}, key=list(document["rows"]).index):
+        yield from _wrapped(f"- where {name} = ", [_row(row, names) for row in document["rows"][name]], "; ")
+    for name, corners in document["motions"].items():
+        yield from _motion(name, corners, document)
+    yield from ("", "## Locations: what may differ from 0, and how long")
+    for location in document["locations"]:
+        yield from _location(location, document)
+    yield from ("", "## Edges: what may happen")
+    inside = {location["name"]: location["coordinates"] for location in document["locations"]}
+    for edge in document["edges"]:
+        yield from _edge(edge, names, inside[edge["from"]])
+    yield from ("", "## Start and outputs")
+    yield from _start(document["start"], names, noise)
+    for output in document["outputs"]:
+        yield from _output(output, names, len(document["locations"]))
+    for limit in document.get("while", []):
+        yield f"- the document ends when |{limit['output']}| reaches {_number(limit['less'])}"
+
+
+def _motion(name: str, corners: Sequence[Table], document: Table) -> Iterator[str]:
+    names = [coordinate["name"] for coordinate in document["coordinates"]]
+    mixture = "exactly" if len(corners) == 1 else f"any mixture of {len(corners)} corners; the first one:"
+    yield from ("", f"## Motion {name!r}: {mixture}")
+    still = {document["decaying"]["coordinate"] if document.get("decaying") else "", document.get("constant")}
+    still |= {coordinate["name"] for coordinate in document["coordinates"] if coordinate.get("noise")}
+    corner = corners[0]
+    for i, row in enumerate(corner["matrix"]):
+        signals = [unknown["column"][i][0] for unknown in corner["unknown"]]
+        if names[i] not in still:
+            rate = _row([*row, *signals], [*names, *(f"p{k}" for k in range(1, len(signals) + 1))])
+            yield from _wrapped(f"- d/dt {names[i]} = {rate}", [], "")
+    for k, unknown in enumerate(corner["unknown"], 1):
+        sizes = "; ".join(_row(row, names) for row in unknown["rows"])
+        along = ""
+        if "along" in unknown:
+            least = _number(unknown["least"])
+            along = f", and p{k} · ({_row(unknown['along'][0], names)}) ≥ {least} p{k}²"
+        yield from _wrapped(f"- p{k} is unknown: |p{k}| ≤ |{sizes}|{along}", [], "")
+
+
+def _location(location: Table, document: Table) -> Iterator[str]:
+    noise = {c["name"] for c in document["coordinates"] if c.get("noise")}
+    units = {document.get("constant"), (document.get("decaying") or {}).get("coordinate")}
+    every = [c["name"] for c in document["coordinates"] if c["name"] not in noise | units]
+    missing = [name for name in every if name not in location["coordinates"]]
+    parts = [f"moves as {location['motion']!r}"]
+    if location.get("clock") is not None:
+        parts.append(f"at most {_time(location['clock'])}")
+    if location["facts"]:
+        parts.append(f"always {', '.join(location['facts'])}")
+    parts.append(f"0 here: {', '.join(missing)}" if missing else "nothing is 0")
+    yield from _wrapped(f"- {location['name']}: ", parts, "; ")
+
+
+def _edge(edge: Table, names: Sequence[str], inside: Sequence[str]) -> Iterator[str]:
+    changes = []
+    for i, row in enumerate(edge.get("jump", [])):
+        is_changed = [_value(v) for v in row] != [int(i == j) for j in range(len(names))]
+        if is_changed and (names[i] in inside or any(map(_value, row))):
+            changes.append(f"{names[i]} := {_row(row, names)}")
+    parts = [f"from {edge['from']} to {edge['to'] if edge['to'] is not None else 'nowhere: never taken'}"]
+    if edge.get("when") is not None:
+        first, last = edge["when"]
+        when = _time(last) if _value(first) == _value(last) else f"{_time(first)} to {_time(last)}"
+        parts.append(f"at {when}")
+    parts.append(
+        {"zero": "the clock is set to 0", "keeps": "the clock goes on", "any": "any clock"}[edge["clock"]]
+    )
+    if edge["facts"]:
+        parts.append(f"if {', '.join(edge['facts'])}")
+    parts.append(", ".join(changes) if changes else "nothing changes")
+    yield from _wrapped(f"- {edge['name']}: ", parts, "; ")
+
+
+def _start(start: Table, names: Sequence[str], noise: Sequence[str]) -> Iterator[str]:
+    values = []
+    for name, row in zip(names, start["columns"], strict=True):
+        if name not in noise and any(map(_value, row)):
+            values.append(f"{name} = {_row(row, ['', *noise])}")
+    facts = f", {', '.join(start['facts'])}" if start["facts"] else ""
+    yield from _wrapped(f"- starts in {start['location']}{facts} with ", values, ", ")
+
+
+def _output(output: Table, names: Sequence[str], locations: int) -> Iterator[str]:
+    unit = f" [{output['unit']}]" if output["unit"] else ""
+    where = "" if len(output["in"]) == locations else f", in {', '.join(output['in'])}"
+    if "input" in output:
+        what = f"entry {output['input']} of the input"
+    else:
+        what = "; ".join(_row(row, names) for row in output["rows"])
+        if "velocity" in output:
+            velocity = "; ".join(_row(row, names) for row in output["velocity"])
+            what = f"d/dt of ({velocity}) plus ({what})"
+    yield from _wrapped(f"- output {output['name']}{unit} = ", [f"{what}{where}"], " ")
+
+
+def _row(row: Sequence[Any], names: Sequence[str]) -> str:
+    """Return a combination such as "2 angle − 0.1 e angle"."""
+    parts: list[str] = []
+    for entry, name in zip(row, names, strict=True):
+        if (value := _value(entry)) == 0:
+            continue
+        size = "" if abs(value) == 1 and name else _number(abs(value))
+        sign = "−" if value < 0 else "+"
+        term = " ".join(part for part in (size, name) if part)
+        parts.append(f"{sign} {term}" if parts else f"{'−' if value < 0 else ''}{term}")
+    return " ".join(parts) or "0"
+
+
+def _value(entry: Any) -> float:
+    if isinstance(entry, list):
+        return sum(map(_value, entry)) / 2
+    return float(Fraction(entry)) if isinstance(entry, str) else float(entry)
+
+
+def _number(entry: Any) -> str:
+    return f"{_value(entry):.{_DIGITS}g}".replace("-", "−")
+
+
+def _time(entry: Any) -> str:
+    return "0" if _value(entry) == 0 else f"{_number(_value(entry) * _MS)} ms"
+
+
+def _with_unit(coordinate: Table) -> str:
+    return f"{coordinate['name']} [{coordinate['unit']}]" if coordinate["unit"] else str(coordinate["name"])
+
+
+def _wrapped(begin: str, parts: Sequence[str], joint: str) -> list[str]:
+    """Return lines of parts that are joined, the later lines indented."""
+    return textwrap.wrap(begin + joint.join(parts), _WIDTH, subsequent_indent="  ", break_on_hyphens=False)
