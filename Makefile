@@ -100,7 +100,7 @@ netem: setup ## The network: loses at most M - 1 consecutive packets
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test test-system test-deep witnesses fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
+.PHONY: setup setup-dev test test-system test-deep witnesses proofs fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
 setup: $(VENV)/.installed ## Create the environment in .venv (the other targets do this if needed)
 
 setup-dev: $(VENV)/.installed-dev
@@ -131,6 +131,9 @@ test-deep: setup-dev ## Masses of random inputs, long searches, an hour of fuzz 
 	$(call LEVEL,deep)
 	$(PYTEST) tests/fuzz --hypothesis-profile search $(AT_ONCE)
 	$(MAKE) --no-print-directory fuzz soak MINUTES=$(if $(filter file,$(origin MINUTES)),60,$(MINUTES))
+
+proofs: setup ## Search the proofs of the shipped scenarios again; fail if a bound grew by more than 3 % (an hour)
+	$(BIN)/python tools/write_proofs.py $(ARGS)
 
 witnesses: setup-dev ## Search the tests' witnesses again; fail if a bound grew by more than 3 %
 	$(BIN)/python -m tests.checker.write_witnesses $(ARGS)

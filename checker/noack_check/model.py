@@ -224,6 +224,7 @@ class Model:
         pieces: of the period of a periodic rule, or of the time between tests, on which P is affine.
         by_tests: V depends on where each update is at each test, which is at an exact time.
         counted: V depends on the number of silent tests since the last event, up to so many.
+        blocks: V has no products of an update on its way with other states. Then flows split into blocks.
         is_exact: with False a coarse approximation of K e^{−Hs} replaces its hull, for a search.
     """
 
@@ -240,11 +241,13 @@ class Model:
         pieces: int = 1,
         by_tests: bool = False,
         counted: int = 0,
+        blocks: bool = False,
         is_exact: bool = True,
     ) -> None:
         self.loop, self.rate, self.decay, self.errors = loop, rate, decay, errors
         self.later, self.is_exact = later, is_exact
         self.counted = counted
+        self._blocks = blocks and not loop.rule.negative.nrows()
         self.later_at_start = later_at_start
         self.is_periodic = loop.times.period > 0
         self._pieces, self.memory = pieces, loop.rule.memory
@@ -712,9 +715,13 @@ class Model:
         own = f"{place.name}, {node}" if by_node else place.name
         starts = place.name.startswith("start")
         X = f"X/start, {node}" if starts else "X"
+        later = self.later_of(location) if self._blocks else 0
+        present = [f for f in self.error_rows if not is_zero(f * E)]
+        kept = len(present) - later
         parts: tuple[tuple[str, arb_mat], ...] = (
             (X, stack([self.moving, self.s]) * E),
-            (f"Q/{own}", errors * E),
+            (f"Q/{own}", stack(present[:kept]) * E),
+            *((f"V{k}/{own}", f * E) for k, f in enumerate(present[kept:], 1)),
         )
         if rule.negative.nrows() or self.is_periodic:
             parts = ((f"P/{own}", stack([self.moving, self.s, errors]) * E),)
@@ -771,6 +778,15 @@ class Model:
         names = ((f"{kinds[-1]}, {knot} silent, {node}", s * place.nodes[-1]) for knot, s in around if s > 0)
         return [common, *names]
 
+    def block_sizes(self, location: int) -> list[int]:
+        """Return the sizes of the forms of updates on their way that have no products with other states."""
+        return [self._seen.nrows()] * self.later_of(location) if self._blocks else []
+
+    def later_of(self, location: int) -> int:
+        """Return how many updates were sent after the one on its way; 0 in other locations."""
+        name = self.locations[location].name.removeprefix("start, ")
+        return int(name.split(" ")[0]) if name.endswith(" later") else 0
+
     # The inequalities.
 
     def inequalities(self, output: str, *, starts: bool) -> Iterator[Inequality]:
@@ -786,11 +802,28 @@ class Model:
     def common_inequalities(self) -> Iterator[Inequality]:
         """Yield those of flows and edges, which are the same for all outputs, and affine in ν."""
         for index in range(len(self.locations)):
-            yield from self._flow_inequalities(index)
+            yield from self._by_blocks(self._flow_inequalities(index))
         for edge in self.edges:
             yield from self._edge_inequalities(edge)
         if self.memory is not None:
             yield from (self._memory_inequality(index) for index in range(len(self.locations)))
+
+    @staticmethod
+    def _by_blocks(items: Iterable[Inequality]) -> Iterator[Inequality]:
+        """Yield inequalities without the forms of updates on their way, and one for each of these forms.
+
+        Nothing else has the states of such an update, which move on their own: the matrix is block diagonal.
+        It is the same one for all corners.
+        """
+        for item in items:
+            blocks = {part.name for part in item.parts if part.name.startswith("V")}
+            yield item._replace(parts=tuple(part for part in item.parts if part.name not in blocks))
+            kinds = sorted({name.split("/")[0] for name in blocks})
+            for kind in kinds if item.name.endswith("/0") else []:
+                parts = tuple(part for part in item.parts if part.name.split("/")[0] == kind)
+                yield item._replace(
+                    name=f"{item.name}, {kind}", parts=parts, scalars=(), constant=0 * item.constant
+                )
 
     def _memory_inequality(self, index: int) -> Inequality:
         """The coefficient of y² after a test is at least 0."""
@@ -807,7 +840,7 @@ class Model:
         """Yield those of an output; the drift has none before the first input."""
         for index, place in enumerate(self.locations):
             if not place.name.startswith("start") or output != "drift":
-                yield from self._output_inequalities(index, output)
+                yield from self._by_blocks(self._output_inequalities(index, output))
 
     def _flow_inequalities(self, index: int) -> Iterator[Inequality]:
         """dV/dt + νV ≤ Σ m q + Σ τ (|p|² − |Rz|²), at both ends of each piece of θ."""

@@ -192,11 +192,13 @@ class Assumptions(NamedTuple):
     """V depends on where each update is at each test."""
     counted: int = 0
     """It depends on the number of silent tests since the last event, too, up to so many."""
+    blocks: bool = False
+    """It has no products of an update on its way with other states."""
 
     @property
     def of_model(self) -> dict[str, Any]:
         """Further arguments of the model."""
-        names = ("later", "later_at_start", "pieces", "by_tests", "counted")
+        names = ("later", "later_at_start", "pieces", "by_tests", "counted", "blocks")
         return {name: getattr(self, name) for name in names}
 
 
@@ -225,8 +227,11 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     counted = read_count(document, "counted", MOST_PLACES) if "counted" in document else 0
     if counted and not by_tests:
         raise RejectedError("counted: only forms of each test count tests")
+    blocks = document.get("blocks", False) is True
+    if blocks and (by_tests or loop.times.period > 0):
+        raise RejectedError("blocks: not with a periodic rule, or with forms of each test")
     if "errors" not in document:
-        return Assumptions(None, later, at_start, chain, pieces, noise, by_tests, counted)
+        return Assumptions(None, later, at_start, chain, pieces, noise, by_tests, counted, blocks)
     if loop.times.period > 0 or by_tests:
         raise RejectedError("errors: of no use with a periodic rule, or with forms of each test")
     table = document["errors"]
@@ -238,7 +243,7 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     units = loop.has_decaying_unit(rate), loop.needs_constant
     if not all(size == 0 or (size > 0 and is_unit) for size, is_unit in zip(sizes, units, strict=True)):
         raise RejectedError("errors: below 0, or in a unit that the loop does not have")
-    return Assumptions(Errors(*sizes, chain), later, at_start, chain, pieces, noise)
+    return Assumptions(Errors(*sizes, chain), later, at_start, chain, pieces, noise, blocks=blocks)
 
 
 def _read_smooth(loop: Loop, document: Mapping[str, object]) -> Smooth:

@@ -1,9 +1,10 @@
-"""Witnesses that were found earlier, in the user's cache folder: a search takes seconds, a check 0.3 s.
+"""Witnesses that were found earlier: a search takes seconds to minutes, a check 0.3 s.
 
-Nothing that is stored is believed: the checker proves each document again, for the loop at hand. A file
-that is damaged, or another user's, counts as missing. What is stored counts for searches that are not
-longer: the short search of a run may find larger bounds. That a search found nothing is stored, too; this
-counts for the same version of noack.
+They are in the user's cache folder. Those of the shipped scenarios are files of the package, which
+``make proofs`` writes. Nothing that is stored is believed: the checker proves each document again, for the
+loop at hand. A file that is damaged, or another user's, counts as missing. What is stored counts for
+searches that are not longer: the short search of a run may find larger bounds. That a search found nothing
+is stored, too; this counts for the same version of noack.
 """
 
 import hashlib
@@ -20,6 +21,8 @@ from flint import arb, arb_mat
 from noack.core.file_access import create_folder, new_file, open_regular, remove_file
 from noack_check.loop import Loop
 
+SHIPPED, INDEX = Path(__file__).parent / "shipped_proofs", "index.json"
+"""Proofs of the package, and the file that has their names by the loop's key."""
 _FORM = "2"
 """Of the documents; another one has other keys."""
 _MOST_BYTES, _MOST_FILES = 20_000_000, 300
@@ -50,17 +53,18 @@ class WitnessStore:
 
     def read(self, wanted: Sequence[str], most_work: float) -> StoredSearch | None:
         """Return what a search for some outputs with this limit of work would find; None: it is not known."""
+        with suppress(*_UNREADABLE):
+            if (found := _stored(self._read_shipped(), wanted, most_work)) is not None:
+                return found
         with suppress(*_UNREADABLE), open_regular(_folder() / self.name) as file:
             if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
                 return None
-            content = json.loads(file.read(_MOST_BYTES))
-            if not ({*wanted} <= {*content["wanted"]} and content["most_work"] >= most_work):
-                return None
-            if content["document"] is not None:
-                return StoredSearch(content["document"])
-            if content["noack"] == version("noack"):
-                return StoredSearch(None, str(content["reason"]))
+            return _stored(file.read(_MOST_BYTES), wanted, most_work)
         return None
+
+    def _read_shipped(self) -> bytes:
+        index = json.loads((SHIPPED / INDEX).read_bytes())
+        return (SHIPPED / index[self.name.removesuffix(".json")]).read_bytes()
 
     def write(self, found: StoredSearch, wanted: Sequence[str], most_work: float) -> None:
         """Keep what a search found; without space or permission nothing is kept."""
@@ -70,6 +74,16 @@ class WitnessStore:
             with new_file(folder / self.name, mode=0o600) as file:
                 file.write(json.dumps(content, allow_nan=False).encode())
             _remove_oldest(folder)
+
+
+def _stored(text: bytes, wanted: Sequence[str], most_work: float) -> StoredSearch | None:
+    """Return what a file says of a search; None: it says nothing, or another version found nothing."""
+    content = json.loads(text)
+    if not ({*wanted} <= {*content["wanted"]} and content["most_work"] >= most_work):
+        return None
+    if content["document"] is not None:
+        return StoredSearch(content["document"])
+    return StoredSearch(None, str(content["reason"])) if content["noack"] == version("noack") else None
 
 
 def _folder() -> Path:

@@ -18,6 +18,8 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.core.progress import Progress, no_progress, part_of
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations, trace
+from noack.proof.files import proof_files
+from noack.proof.loop_document import Naming, NoDocumentError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import with_stated_numbers
@@ -41,6 +43,7 @@ from noack_check.loop import Loop
 from noack_check.proof import Proof, prove
 from noack_check.scenario import Enclosed as EnclosedPlant
 from noack_check.scenario import read_loop
+from noack_kernel import RejectedError as RejectedByKernelError
 
 _NEAR = 1e-3
 """The equations near 0, in multiples of typical sizes: they tell searches for other plants apart."""
@@ -206,6 +209,12 @@ def find_statement(
     except (RefusedError, NoWitnessError, NotEnclosedError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
+    try:
+        proof_files(loop, document, Naming(resolved.name)).verify()
+    except NoDocumentError:  # bounds by gains, which only the checker verifies
+        pass
+    except RejectedByKernelError as error:
+        return WitnessedStatement(plants, conditions, None, None, f"the kernel rejects the proof: {error}")
     return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds, loop)
 
 

@@ -227,7 +227,7 @@ def test_a_loop_that_is_too_large_is_refused_at_once_with_what_is_small_enough()
     )
     short = loop._replace(times=loop.times._replace(delay=fmpq(30, 1000)))
     document = {**first_assumptions(short, 0.1), "pieces": 16}
-    require_small(short, number(0.1), document)
+    require_small(short, number(0.1), document, effort.most_per_problem)
 
 
 @pytest.mark.parametrize(("kind", "seed", "output"), [("threshold", 105, "e_c"), ("periodic", 11, "x")])

@@ -21,7 +21,7 @@ from noack.theory.witnesses.coordinates import floats, simulated_frames
 from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
 from noack.theory.witnesses.gains import find_by_gains, find_gains
 from noack.theory.witnesses.line_search import search_lowest
-from noack.theory.witnesses.problem_size import require_small
+from noack.theory.witnesses.problem_size import require_small, work_of_loop
 from noack.theory.witnesses.search import FREE, Found, Search, refined
 from noack.theory.witnesses.semidefinite import Accuracy
 from noack.theory.witnesses.templates import Templates
@@ -61,6 +61,8 @@ _COUNTED = 32, 128
 """Silent tests that are counted since an event, until there is a witness."""
 _MOST_LOSSES = 24
 _MOST_GUESSES = 6
+_LARGE = 1.0
+"""Problems of more 10⁹ products per step are made smaller, though some bounds become larger."""
 _EXPECTED = 5
 """Problems that are solved for an output, about."""
 
@@ -191,7 +193,7 @@ def _confirmed(
     loop: Loop, rates: "_Rates", effort: Effort, shares: "Shares", *, is_rough: bool = False
 ) -> tuple[dict[str, object], "_OutputSearch"]:
     """Return a document with assumptions that the bound of the drift confirms, and the search with them."""
-    document = first_assumptions(loop, rates.rate)
+    document = _with_blocks(loop, first_assumptions(loop, rates.rate))
     for _ in range(_MOST_GUESSES):
         search = _OutputSearch(loop, rates, document, shares, effort, is_rough=is_rough)
         levels = search.best_share("drift", starts=True)[1].levels
@@ -201,6 +203,18 @@ def _confirmed(
         document = following
         effort.expect(_EXPECTED)
     raise NoWitnessError("errors: the sensor's error may be larger than each guess of it")
+
+
+def _with_blocks(loop: Loop, document: dict[str, object]) -> dict[str, object]:
+    """Return a document whose forms have no products of updates on their way, if those would be large."""
+    rate = document["rate"]
+    assert isinstance(rate, float)
+    if not document["later"]:
+        return document
+    with contextlib.suppress(RejectedError):  # the document says something else that is not so
+        if work_of_loop(loop, number(rate), document) > _LARGE:
+            return {**document, "blocks": True}
+    return document
 
 
 class RoughBounds(NamedTuple):
@@ -241,7 +255,7 @@ def rough_bounds(
 
 def _by_quadratic_forms(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) -> Witness:
     """Return a witness for any rule: e_s has quadratic forms, too, and each test may be an event."""
-    document = without_drift(loop, first_assumptions(loop, rates.rate))
+    document = _with_blocks(loop, without_drift(loop, first_assumptions(loop, rates.rate)))
     search = _OutputSearch(loop, rates, document, rates.shares(wanted.near), effort)
     sensor = search.bound("e_s")
     return search.witness(document, [*search.bounds(wanted), sensor], wanted)
@@ -261,7 +275,12 @@ def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort, tried: Sequence[int] 
     last: tuple[_OutputSearch, str] | None = None
     if not by_tests:  # a solver that fails with few pieces takes long, and more pieces may be needed
         rate = _Rates(loop, slow=0.3).rate
-        require_small(loop, number(rate), {**first_assumptions(loop, rate), "pieces": _PIECES[-1]})
+        require_small(
+            loop,
+            number(rate),
+            {**first_assumptions(loop, rate), "pieces": _PIECES[-1]},
+            effort.most_per_problem,
+        )
     pairs = [(pieces, 0) for pieces in tried or (_PIECES_OF_TESTS if by_tests else _PIECES)]
     shares: tuple[float, ...] = (0.3, 0.02)
     if loop.rule.memory is not None and loop.holds:  # one test bounds no K e_s, the time since the event does
@@ -373,7 +392,7 @@ class _OutputSearch:
         require_few(document)
         try:
             self._assumed = read_assumptions(loop, self._rate, document)
-            require_small(loop, self._rate, document)
+            require_small(loop, self._rate, document, effort.most_per_problem)
             self._templates = Templates(self._model)
         except ValueError as error:
             raise NoWitnessError(str(error)) from None

@@ -6,9 +6,9 @@ from noack.core.progress import Progress
 
 MOST_WORK = 20.0
 """A search ends after so many 10⁹ products per step of the solver: some minutes."""
-MOST_PER_PROBLEM = 2.0
-"""A larger problem takes minutes, and seldom ends well: those of the F-16 under its schedule are 12 to 14.
-In eleven shipped scenarios with a proof the largest one is 0.5."""
+PROBLEMS = 10
+"""A search has work for at least so many problems. A larger problem takes minutes: those of the F-16 under
+its schedule need 9 to 17. In eleven shipped scenarios the largest one is 0.5."""
 _LAST_SHARE = 0.99
 
 
@@ -24,9 +24,9 @@ class TooLargeError(WorkLimitError):
     """A problem is too large for the solver."""
 
 
-def too_large(work: float) -> TooLargeError:
-    """Return that a problem needs so many 10⁹ products per step, which are too many."""
-    share = math.ceil(10 * work / MOST_PER_PROBLEM) / 10
+def too_large(work: float, most: float) -> TooLargeError:
+    """Return that a problem needs so many 10⁹ products per step, which are more than ``most``."""
+    share = math.ceil(10 * work / most) / 10
     return TooLargeError(
         f"the loop's inequalities are too large for the search, by a factor of {max(share, 1.1):g}"
     )
@@ -42,6 +42,7 @@ class Effort:
 
     def __init__(self, progress: Progress, most_work: float = MOST_WORK) -> None:
         self._progress, self._most_work = progress, most_work
+        self.most_per_problem = most_work / PROBLEMS
         self._problems, self._expected, self._work, self._share = 0, 0, 0.0, 0.0
 
     def expect(self, problems: int) -> None:
@@ -55,8 +56,8 @@ class Effort:
             WorkLimitError: it is one too many.
             TooLargeError: it is too large.
         """
-        if work > MOST_PER_PROBLEM:
-            raise too_large(work)
+        if work > self.most_per_problem:
+            raise too_large(work, self.most_per_problem)
         if self._work + work > self._most_work:
             raise WorkLimitError(
                 f"{output}: the search ended after {self._problems} problems, at its limit of work"

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from flint import arb, fmpq
 
-from noack.theory.witnesses.effort import MOST_PER_PROBLEM, TooLargeError, too_large
+from noack.theory.witnesses.effort import TooLargeError, too_large
 from noack_check.document import read_count
 from noack_check.loop import Loop
 from noack_check.model import Model
@@ -20,13 +20,13 @@ def work_of(sizes: Iterable[int]) -> float:
     return sum(count**3 + _PER_ENTRY * count for count in entries) / 1e9
 
 
-def require_small(loop: Loop, rate: arb, document: Mapping[str, object]) -> None:
-    """Raise TooLargeError, with what would be small enough, if a document's problem is too large."""
-    if (work := _work_of_loop(loop, rate, document)) > MOST_PER_PROBLEM:
-        raise TooLargeError(f"{too_large(work)}; {_what_fits(loop, rate, document)}")
+def require_small(loop: Loop, rate: arb, document: Mapping[str, object], most: float) -> None:
+    """Raise TooLargeError, with what would be small enough, if a document's problem needs more work."""
+    if (work := work_of_loop(loop, rate, document)) > most:
+        raise TooLargeError(f"{too_large(work, most)}; {_what_fits(loop, rate, document, most)}")
 
 
-def _work_of_loop(loop: Loop, rate: arb, document: Mapping[str, object]) -> float:
+def work_of_loop(loop: Loop, rate: arb, document: Mapping[str, object]) -> float:
     """Return the work for one output."""
     assumed = read_assumptions(loop, rate, document)
     model = Model(loop, rate, arb(1), assumed.errors, assumed.noise, **assumed.of_model, is_exact=False)
@@ -36,9 +36,12 @@ def _work_of_loop(loop: Loop, rate: arb, document: Mapping[str, object]) -> floa
 def problem_sizes(model: Model) -> Iterator[int]:
     """Yield the sizes of the inequalities that bound ‖x‖ in the limit, which are as many as for others."""
     noise = model.bounds.columns.ncols()
-    for place in model.locations:
+    for index, place in enumerate(model.locations):
         size = len(place.coordinates) + (noise if place.silent else 0)
         ends = max(2 * (len(place.nodes) - 1), 1)
+        if blocks := model.block_sizes(index):
+            size -= sum(blocks)
+            yield from blocks * (ends + len(place.nodes))
         for _ in range(ends):
             yield from (size + len(flow.unknowns) for flow in place.flows)
         yield from (size for _ in place.nodes)
@@ -49,11 +52,11 @@ def problem_sizes(model: Model) -> Iterator[int]:
         yield from (1 for _ in model.locations)
 
 
-def _what_fits(loop: Loop, rate: arb, document: Mapping[str, object]) -> str:
+def _what_fits(loop: Loop, rate: arb, document: Mapping[str, object], most: float) -> str:
     """Return in words how many losses, or which delay, would make a loop's problem small enough."""
 
     def fits(smaller: Loop, **counts: int) -> bool:
-        return _work_of_loop(smaller, rate, {**document, **counts}) <= MOST_PER_PROBLEM
+        return work_of_loop(smaller, rate, {**document, **counts}) <= most
 
     fewer_losses = reversed(range(loop.losses))
     losses = next((count for count in fewer_losses if fits(loop._replace(losses=count))), None)

@@ -1,0 +1,40 @@
+"""The two files of a proven statement: its loop document, and the proof of the document's bounds."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from noack.proof.forms_proof import as_text, write_proof
+from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
+from noack_check.document import read_number
+from noack_check.loop import Loop
+from noack_check.proof import read_assumptions
+from noack_kernel import Statement, prove
+
+
+class ProofFiles(NamedTuple):
+    """A loop document and a proof of its bounds."""
+
+    table: Mapping[str, Any]
+    """The document."""
+    document: str
+    proof: str
+    """The contents of the files."""
+
+    def verify(self) -> list[Statement]:
+        """Return what the kernel proves; raise its RejectedError if it rejects the proof."""
+        return prove(self.document, self.proof)
+
+
+def proof_files(loop: Loop, statement: Mapping[str, object], naming: Naming) -> ProofFiles:
+    """Return the files of a statement about a loop, as the search has found it.
+
+    Raises:
+        NoDocumentError: it has no bounds by quadratic forms, or no document describes the loop.
+    """
+    bounds = statement.get("bounds")
+    if not isinstance(bounds, list) or not bounds:
+        raise NoDocumentError("the bounds are by gains; only bounds by quadratic forms have one")
+    rate = read_number(statement, "rate")
+    outputs = [str(bound["output"]) for bound in bounds]
+    document = LoopDocument(loop, rate, read_assumptions(loop, rate, statement), outputs, naming)
+    return ProofFiles(document.table, as_text(document.table), as_text(write_proof(document, bounds)))
