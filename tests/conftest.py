@@ -137,7 +137,7 @@ def without_viewer(no_recording: None, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write pages whose figures are not drawn, which takes most of their time."""
-    monkeypatch.setattr("cosim.output.page_kit.inline", lambda _: "<svg></svg>")
+    monkeypatch.setattr("cosim.output.page_kit.inline", lambda *_: "<svg></svg>")
 
 
 @pytest.fixture

@@ -107,10 +107,10 @@ def state_curves(
     The widths differ, so that equal curves stay visible one inside the other.
     """
     sources = [
-        ("x plant", x, CurveStyle(PLANT, 4.2)),
+        ("x plant", x, CurveStyle(PLANT, 5.4)),
         ("x̂ sensor", x_hat, CurveStyle(SENSOR, 1.0, (1, 1))),
-        ("x_s sensor", x_s, CurveStyle(SENSOR)),
-        ("x_c controller", x_c, CurveStyle(CONTROLLER, 2.4)),
+        ("x_s sensor", x_s, CurveStyle(SENSOR, 1.2)),
+        ("x_c controller", x_c, CurveStyle(CONTROLLER, 3.2)),
         ("x_r reference", x_r, CurveStyle(THRESHOLD, 1.2, (4, 2))),
     ]
     return [
@@ -134,7 +134,7 @@ def output_curves(output: LoopOutput, t_s: Vector, distance: Vector) -> list[Cur
 def error_curves(t_s: Vector, e_s: Vector, e_c: Vector, threshold: Vector | None) -> list[Curve]:
     """Return the norms of both errors, and the trigger's threshold where it is known, (k,) each."""
     curves = [
-        Curve(ERRORS, "‖e_c‖ controller", "", t_s, e_c, CurveStyle(CONTROLLER, 2.6)),
+        Curve(ERRORS, "‖e_c‖ controller", "", t_s, e_c, CurveStyle(CONTROLLER, 3.4)),
         Curve(ERRORS, "‖e_s‖ sensor", "", t_s, e_s, CurveStyle(SENSOR, 1.1)),
     ]
     if threshold is not None:
@@ -160,7 +160,7 @@ def input_curves(names: Sequence[str], t_s: Vector, u: Matrix) -> list[Curve]:
             CurveStyle(
                 palette.SERIES[i % colours],
                 # Inputs often coincide: the first ones are wider, and stay visible under the last.
-                1.3 + 2.6 * (m - 1 - i) / m,
+                1.2 + 4.0 * (m - 1 - i) / m,
                 DASHES[i // colours % len(DASHES)],
                 is_held=True,
             ),

@@ -1,7 +1,7 @@
 """The writer of all HTML pages: a document becomes a page by the templates in ``pages/``.
 
 :func:`document_page` writes every page, of the one template ``document.html.jinja``. All text is escaped;
-figures are drawn where they are used.
+figures are drawn where they are used, for a wide screen and for a narrow one.
 """
 
 import tomllib
@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from cosim.output.document import Document, Sentence, SentenceRole
 from cosim.output.figures.figure_files import inline, save_figures
-from cosim.output.figures.figure_format import FigureFiles
+from cosim.output.figures.figure_format import PHONE_IN, SCREEN_IN, FigureFiles
 from cosim.output.figures.page_figure import PageFigure
 from cosim.output.result_tables import Tone
 from cosim.record.run_directory import write_output
@@ -38,6 +38,7 @@ def _template() -> Template:
         lstrip_blocks=True,
     )
     environment.filters["inline"] = _markup
+    environment.globals["phone_in"] = PHONE_IN
     return environment.get_template("document.html.jinja")
 
 
@@ -64,8 +65,8 @@ def save_page(document: Document, path: Path, files: FigureFiles | None = None) 
     ]  # fmt: skip
 
 
-def _markup(figure: PageFigure) -> Markup:
-    return Markup(inline(figure))
+def _markup(figure: PageFigure, width_in: float = SCREEN_IN) -> Markup:
+    return Markup(inline(figure, width_in))
 
 
 def words(key: str) -> str:

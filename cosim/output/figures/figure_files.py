@@ -74,16 +74,17 @@ def file_content(figure: PageFigure, kind: FigureFormat, width_in: float = SCREE
     return buffer.getvalue()
 
 
-def inline(figure: PageFigure) -> str:
+def inline(figure: PageFigure, width_in: float = SCREEN_IN) -> str:
     """Return a figure as HTML: SVG with the page's colours, or PNG if the SVG would be large.
 
-    The figure's name, a word, makes its ids unique on the page.
+    The figure's name, a word, and its width make its ids unique on the page.
     """
     description = figure.description or figure.caption
-    text = _page_svg(file_content(figure, FigureFormat.SVG), figure.name, description)
-    if len(text) <= _MOST_SVG_CHARACTERS:
+    name = figure.name if width_in == SCREEN_IN else f"{figure.name}-{width_in:g}in"
+    text = _page_svg(file_content(figure, FigureFormat.SVG, width_in), name, description)
+    if len(text) <= _MOST_SVG_CHARACTERS * min(width_in / SCREEN_IN, 1.0):
         return text
-    picture = base64.b64encode(file_content(figure, FigureFormat.PNG)).decode()
+    picture = base64.b64encode(file_content(figure, FigureFormat.PNG, width_in)).decode()
     image = ET.Element("img", {"src": f"data:image/png;base64,{picture}", "alt": description})
     return ET.tostring(image, encoding="unicode")
 

@@ -8,6 +8,8 @@ from noack.core.number_checks import one_of
 
 SCREEN_IN = 10.0
 """Width of a figure on a page of noack, in inches."""
+PHONE_IN = 3.5
+"""Width of the same figure on a narrow screen: its texts, of 8 points, become 11 pixels there."""
 WIDTHS_IN = {"column": 3.5, "page": 7.16}
 """Widths in a paper of two columns (IEEE), in inches."""
 _NARROWEST_IN, _WIDEST_IN = 3.0, 20.0

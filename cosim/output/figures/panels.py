@@ -33,7 +33,7 @@ BAR_IN = 0.2
 """Width of a colour bar."""
 _BESIDE_GAP_IN = 0.27
 _SHORT_LABELS = (
-    ("certified for every plant of the uncertainty ", "certified: "),
+    ("certified for every plant of the uncertainty box", "certified: all plants"),
     ("certified for the scenario's ", "certified: "),
     ("bound, given ", "given "),
 )

@@ -379,14 +379,17 @@ def _outputs(record: RunRecord, bounds: Mapping[str, list[Curve]]) -> PageFigure
         for i, (output, curves) in enumerate(drawn.items()):
             axes = figure.add_axes((0, 0, 1, 1))
             title = f"{label_text(output.name)}: distance from its {target}"
-            far = [
-                _lowest(bound)
-                for bound in bounds[output.name]
-                if all(bound is not each for each in near[output])
-            ]
-            if far:
-                title += f" (bound {label_text(output.quantity(f'{min(far):.3g}'))} or more, not drawn)"
             draw_norms(axes, title, curves, near[output])
+            for bound in bounds[output.name]:
+                if all(bound is not each for each in near[output]):
+                    least = label_text(output.quantity(f"{_lowest(bound):.3g}"))
+                    # An entry of the legend, without a curve.
+                    draw_curve(
+                        axes,
+                        replace(bound, t_s=np.zeros(0), values=np.zeros(0)),
+                        label=f"{bound.name}: above {least}, not drawn",
+                        alpha=_FAR_OPACITY,
+                    )
             low, high = axes.get_ylim()
             if 0 < _FAR * highest[output] < high:
                 axes.set_ylim(top=_FAR * highest[output])

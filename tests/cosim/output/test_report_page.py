@@ -112,7 +112,7 @@ OUTSIDE = """(() => {
     && r.top > box.top - by && r.bottom < box.bottom + by))(e.getBoundingClientRect());
   const page = document.documentElement.getBoundingClientRect();
   const figures = [...document.querySelectorAll('figure svg')].filter(e => e.clientWidth);
-  const fonts = e => 9 * e.clientWidth / e.viewBox.baseVal.width;
+  const fonts = e => (e.closest('.narrow') ? 8 : 9) * e.clientWidth / e.viewBox.baseVal.width;
   const tables = [...document.querySelectorAll('.scroll:has(table)')];
   const scrolled = tables.filter(e => e.scrollWidth > e.clientWidth);
   scrolled.forEach(e => { e.scrollLeft = 30; });
