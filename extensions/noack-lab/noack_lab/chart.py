@@ -17,12 +17,15 @@ _CROSS = "path://M0 1L1 0L5 4L9 0L10 1L6 5L10 9L9 10L5 6L1 10L0 9L4 5Z"
 _PIXELS_PER_POINT = 4 / 3
 _DECADES = 7
 """Below the largest value on a logarithmic axis: an error is 0 after a reset."""
-_TITLE, _LINE, _PLOT, _GAP, _FOOT = 24, 22, 120, 30, 46
+_TITLE, _LINE, _PLOT, _GAP, _FOOT = 24, 25, 120, 30, 46
 """Heights in pixels: the title of a panel, a line of its legend, its axes, the times below them, the
 last axis with its name."""
 _LEFT, _RIGHT = 62, 14
-_LEGEND, _CHARACTER, _KEY = 300, 7.5, 50
-"""Widths in pixels: the legend on a phone, a character of it, the sample and the gap of an entry."""
+_CHARACTER, _KEY = 7.0, 42
+"""Widths in pixels: a character of a legend, the sample and the gap of an entry."""
+_GAP_OF_ENTRIES = 10
+PHONE_PX = 366
+"""Width of a chart on a phone: of one whose width is not known yet."""
 
 
 class Drawn(NamedTuple):
@@ -33,6 +36,7 @@ class Drawn(NamedTuple):
     """Name of the state that is drawn; empty: the first."""
     bounds: Sequence[noack.Curve] = ()
     reference: ShownRun | None = None
+    width_px: int = PHONE_PX
 
 
 def height_px(options: Json) -> int:
@@ -40,12 +44,12 @@ def height_px(options: Json) -> int:
     return int(options["grid"][-1]["top"]) + _PLOT + _FOOT if options["grid"] else _FOOT
 
 
-def _legend_lines(names: Sequence[str]) -> int:
-    """Return how many lines a legend has on a phone, where it wraps."""
+def _legend_lines(names: Sequence[str], room: float) -> int:
+    """Return how many lines a legend has, which wraps at a width in pixels."""
     lines, used = 1, 0.0
     for name in names:
         width = _KEY + _CHARACTER * len(name)
-        if used and used + width > _LEGEND:
+        if used and used + width > room:
             lines, used = lines + 1, 0.0
         used += width
     return lines
@@ -54,7 +58,9 @@ def _legend_lines(names: Sequence[str]) -> int:
 def chart_options(drawn: Drawn) -> Json:
     """Return the options of ECharts."""
     panels = _panels(drawn)
-    end_s = max((float(c.t_s[-1]) for curves in panels.values() for c in curves if len(c.t_s)), default=1.0)
+    ends_s = (float(c.t_s[-1]) for curves in panels.values() for c in curves if len(c.t_s))
+    end_s = drawn.run.end_s or max(ends_s, default=1.0)
+    room = drawn.width_px - _LEFT - _RIGHT
     options: Json = {
         "animation": False,
         "aria": {"enabled": True, "label": {"description": "; ".join(panels)}},
@@ -85,8 +91,8 @@ def chart_options(drawn: Drawn) -> Json:
         )
         names = list(dict.fromkeys(curve.name for curve in curves))
         legend: Json = {"data": names, "top": top + _TITLE, "left": _LEFT - 6, "right": _RIGHT}
-        options["legend"].append(legend | {"itemGap": 14, "textStyle": {"fontSize": 13}})
-        top += _TITLE + _LINE * _legend_lines(names) + 2
+        options["legend"].append(legend | {"itemGap": _GAP_OF_ENTRIES, "textStyle": {"fontSize": 13}})
+        top += _TITLE + _LINE * _legend_lines(names, room) + 2
         options["grid"].append({"top": top, "height": _PLOT, "left": _LEFT, "right": _RIGHT})
         top += _PLOT + _GAP
         axis: Json = {"type": "value", "gridIndex": number, "min": 0, "max": float(f"{end_s:.6g}")}
@@ -101,8 +107,9 @@ def chart_options(drawn: Drawn) -> Json:
 
 
 def layout_of(options: Json) -> object:
-    """Return which parts a chart has: panels, kinds of axes, curves."""
+    """Return which parts a chart has: panels and their places, kinds of axes, curves."""
     return (
+        [grid["top"] for grid in options["grid"]],
         [title["text"] for title in options["title"]],
         [axis["type"] for axis in options["yAxis"]],
         [(series["name"], series["yAxisIndex"]) for series in options["series"]],

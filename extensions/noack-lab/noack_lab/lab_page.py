@@ -13,7 +13,7 @@ from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 
 import noack
 from noack_lab import results
-from noack_lab.chart import Drawn, chart_options, height_px, layout_of, values_of
+from noack_lab.chart import PHONE_PX, Drawn, chart_options, height_px, layout_of, values_of
 from noack_lab.lab_services import LabServices
 from noack_lab.results import Guarantee, ShownRun, VerdictText
 from noack_lab.scenario_draft import Draft, open_draft
@@ -51,6 +51,17 @@ _CSS = """
 .lab-side a { color: #1d4ed8; text-decoration: underline; }
 @media (max-width: 600px) { .lab-title { display: none; } }
 """
+_REPORT_WIDTH = """
+let last = 0, timer;
+new ResizeObserver(([stage]) => {
+  clearTimeout(timer);
+  timer = setTimeout(() => {
+    const width = Math.round(document.querySelector('.lab-chart').clientWidth);
+    if (width && width !== last) emitEvent('lab_width', last = width);
+  }, 250);
+}).observe(document.querySelector('.lab-stage'));
+"""
+"""Reports the width of the figure: its legends have as many lines as they need there."""
 
 
 async def show_page(services: LabServices) -> None:
@@ -61,6 +72,7 @@ async def show_page(services: LabServices) -> None:
     page.build()
     await client.connected()
     if not client.is_deleted:  # what asks for the page only, as a preview of links, never connects
+        client.run_javascript(_REPORT_WIDTH)
         await page.open(services.draft)
 
 
@@ -86,6 +98,8 @@ class _Page:
         self._rest: asyncio.Task[None] | None = None
         self._live_version = -1
         self._margin = self._explored_note = ""
+        self._width_px = PHONE_PX
+        """Width of the figure."""
         self._layout: object = None
         """Panels and curves of the chart; with the same, only values are sent."""
 
@@ -137,7 +151,7 @@ class _Page:
                     select.props("dense options-dense")
                 ui.button("replay", icon="replay", on_click=self._replay).props("outline no-caps dense")
         with ui.element("main").classes("lab-stage"):
-            self._chart = ui.echart({}).classes("w-full").props("role=img aria-label=figure")
+            self._chart = ui.echart({}).classes("w-full lab-chart").props("role=img aria-label=figure")
             with ui.element("div").classes("lab-side"):
                 self._progress = ui.linear_progress(0.0, show_value=False).props("aria-label=progress")
                 self._verdict = ui.element("section").classes("lab-verdict").props("aria-label=verdict")
@@ -149,7 +163,12 @@ class _Page:
                 self._log = ui.log(max_lines=200).classes("w-full h-40")
                 self._log.props('tabindex=0 role=region aria-label="log of the run"')
         ui.timer(_POLL_S, self._follow)
+        ui.on("lab_width", self._set_width)
         self._show_parts()
+
+    def _set_width(self, event: GenericEventArguments) -> None:
+        self._width_px = int(event.args)
+        self._draw()
 
     def _toggle_drawer(self) -> None:
         self._drawer.toggle()
@@ -319,7 +338,7 @@ class _Page:
         exploring = self._source == EXPLORE
         reference = (self._kept or self._before) if exploring and self._compare.value else None
         bounds = self._guarantee.curves if exploring and self._guarantee else ()
-        options = chart_options(Drawn(run, self._state, bounds, reference))
+        options = chart_options(Drawn(run, self._state, bounds, reference, self._width_px))
         if (layout := layout_of(options)) == self._layout:
             self._chart.run_chart_method("setOption", values_of(options))
         else:

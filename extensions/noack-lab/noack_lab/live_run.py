@@ -6,6 +6,7 @@ second, warnings, its end.
 
 import asyncio
 import json
+import math
 import os
 import signal
 import subprocess
@@ -47,6 +48,7 @@ class LiveRun:
         """What happened, the newest line last."""
         self.norm_at_start: float | None = None
         """‖x‖ at t = 0; None if the scenario draws it, or has several loops."""
+        self._is_complete = False
         self.version = 0
         """Grows with each change."""
         self._process: asyncio.subprocess.Process | None = None
@@ -76,15 +78,24 @@ class LiveRun:
             noack.Curve(COUNTS, "sent", "", t_s, sent, noack.CurveStyle(_BLUE, 4.0, is_held=True)),
             noack.Curve(COUNTS, "received", "", t_s, received, noack.CurveStyle(_ORANGE, 1.6, is_held=True)),
         ]
-        return ShownRun(LIVE, curves, self._verdict())
+        return ShownRun(
+            LIVE, curves, self._verdict(), end_s=self._axis_end_s(float(t_s[-1])) if len(t_s) else None
+        )
+
+    def _axis_end_s(self, t_s: float) -> float:
+        """Return the end of an axis that rarely changes while the run goes on, such as 5, 10, 20, 50 s."""
+        decade = 10.0 ** math.floor(math.log10(max(t_s, 5.0)))
+        end_s = next(factor * decade for factor in (1, 2, 5, 10) if factor * decade >= max(t_s, 5.0))
+        return min(end_s, self.horizon_s)
 
     def _verdict(self) -> list[VerdictText]:
         if not self.reports:
             return [VerdictText(self.state)]
         report = self.reports[-1]
         late_ms = report["late_us"] / 1000
+        progress = f"{self.state}: {report['t_s']:.1f} of {self.horizon_s:g} s"
         return [
-            VerdictText(f"{self.state}: {report['t_s']:.1f} of {self.horizon_s:g} s"),
+            VerdictText(f"completed {self.horizon_s:g} s" if self._is_complete else progress),
             VerdictText(
                 f"longest loss burst {report['longest_loss_burst']}, largest lateness {late_ms:.3g} ms"
             ),
@@ -168,6 +179,7 @@ class LiveRun:
                 self.reports.append(message)
             case "end":
                 self.state = "ended"
+                self._is_complete = message.get("reason") == "horizon"
                 self.directory = Path(message["directory"])
                 self._add_line(text)
             case _:

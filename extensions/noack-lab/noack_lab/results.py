@@ -53,6 +53,8 @@ class ShownRun:
     note: str = ""
     loops: tuple[str, ...] = ()
     """Names of the loops of a recorded run."""
+    end_s: float | None = None
+    """End of the axis of time; None: the last time that is drawn."""
 
     @property
     def states(self) -> list[str]:

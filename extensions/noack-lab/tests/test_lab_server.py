@@ -90,9 +90,9 @@ def test_nothing_is_computed_for_a_visitor_who_never_connects(
     async def show(draft: Any) -> None:
         opened.append(draft)
 
-    client = SimpleNamespace(connected=connected, is_deleted=False)
-    context = SimpleNamespace(client=client)
     ignored: Any = lambda *_, **__: None  # noqa: E731
+    client = SimpleNamespace(connected=connected, is_deleted=False, run_javascript=ignored)
+    context = SimpleNamespace(client=client)
     monkeypatch.setattr(lab_page, "ui", SimpleNamespace(add_css=ignored, colors=ignored, context=context))
     monkeypatch.setattr(lab_page, "_Page", lambda _: SimpleNamespace(build=ignored, open=show))
     asyncio.run(lab_page.show_page(SimpleNamespace(draft="draft")))  # type: ignore[arg-type]

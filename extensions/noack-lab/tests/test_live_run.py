@@ -4,11 +4,13 @@ import asyncio
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import noack
 from noack_lab.chart import Drawn, chart_options, height_px
 from noack_lab.live_run import LiveRun
+from noack_lab.results import LIVE, NORM, ShownRun
 
 PROGRESS = {
     "t_s": 1.0,
@@ -57,6 +59,30 @@ def test_each_panel_of_the_chart_has_the_time_and_room_for_its_legend() -> None:
     assert height_px(options) > options["grid"][-1]["top"] + options["grid"][-1]["height"]
     sent, received = (run.shown.curves[i].style.width for i in (1, 2))
     assert sent > 2 * received  # both are visible where they coincide
+
+
+@pytest.mark.parametrize(("width_px", "lines"), [(366, 4), (700, 2)])
+def test_a_legend_has_as_many_lines_as_the_width_of_the_chart_needs(width_px: int, lines: int) -> None:
+    names = [
+        "‖x‖ plant",
+        "certified for the scenario's plant",
+        "certified for every plant",
+        "Theorem 2 (eq:normXt)",
+    ]
+    t_s = np.arange(2.0)
+    curves = [noack.Curve(NORM, name, "", t_s, t_s + 1, noack.CurveStyle((0, 0, 0))) for name in names]
+    options = chart_options(Drawn(ShownRun(LIVE, curves), "", width_px=width_px))
+    room = options["grid"][0]["top"] - options["legend"][0]["top"]
+    assert 23 * lines <= room < 23 * (lines + 1)  # a line of 13 pixels, and a gap of 10
+
+
+@pytest.mark.parametrize(("t_s", "end_s"), [(0.1, 5.0), (5.0, 5.0), (5.1, 10.0), (12.0, 20.0), (70.0, 80.0)])
+def test_the_axis_of_a_live_run_rarely_changes_and_ends_at_the_horizon(t_s: float, end_s: float) -> None:
+    run = LiveRun(80.0)
+    take(run, "progress", **PROGRESS | {"t_s": t_s})
+    assert chart_options(Drawn(run.shown, ""))["xAxis"][0]["max"] == end_s
+    take(run, "end", directory="runs/a", status=0, reason="horizon")
+    assert run.shown.verdict[0].text == "completed 80 s"
 
 
 @pytest.mark.parametrize("line", ["compiling ...", "{", "[1]", '{"x": 1}', "7"])
