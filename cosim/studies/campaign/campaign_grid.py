@@ -46,7 +46,7 @@ class Point:
     """Certified bound Δβ, or None."""
     work: Work
     """Computes the draws of the point."""
-    error_scale: object = None
+    error_scale: tuple[tuple[float, object], ...] = ()
     """What ``sup_e_c_scaled`` is in units of: rate and norm of each loop's threshold."""
 
 
@@ -123,7 +123,11 @@ def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
 def _error_scale(scenario: Scenario) -> tuple[tuple[float, object], ...]:
     """Return rate and norm of the threshold of each loop, which ``sup_e_c_scaled`` depends on."""
     policies = [policy_of(resolve(entry.scenario)) for entry in ResolvedRun(scenario).entries]
-    return tuple((policy.fading_per_s, getattr(policy, "weight", None)) for policy in policies)
+    weights = [getattr(policy, "weight", None) for policy in policies]
+    return tuple(
+        (policy.fading_per_s, None if weight is None else tuple(map(tuple, np.asarray(weight).tolist())))
+        for policy, weight in zip(policies, weights, strict=True)
+    )
 
 
 def _require_comparable(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
@@ -135,7 +139,7 @@ def _require_comparable(campaign: Campaign, points: Sequence[Point], path: Path)
     for i, figure in enumerate(campaign.figures):
         for key, metric in figure.axes_metrics:
             shown = {*campaign.selected(figure.where)}
-            scales = {repr(point.error_scale) for point in points if point.indices in shown}
+            scales = {point.error_scale for point in points if point.indices in shown}
             if metric == OF_THRESHOLD and len(scales) > 1:
                 raise CallerError(
                     f"{path}: figures.{i}.{key} = {metric}: is not comparable: it is "

@@ -51,6 +51,15 @@ def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
     assert "all other runs are kept, and a larger --draws shows them again" in result.stderr
 
 
+@pytest.mark.parametrize("path", sorted(Path("campaigns").glob("*.toml")), ids=lambda path: path.stem)
+@pytest.mark.usefixtures("no_drawing")
+def test_every_shipped_campaign_is_summarised(path: Path, run_command: Command) -> None:
+    """Also where policies with matrices as norms are compared."""
+    result = run_command(path, "--json", "--draws", "2")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["points"]
+
+
 def test_the_page_is_one_file_and_escapes_user_text(write: Write, plan: dict[str, Any], full: Store) -> None:
     plan["axes"][1]["title"] = HOSTILE
     path = write(plan, description=HOSTILE)
