@@ -143,9 +143,9 @@ def growth_sentences(growth: Growth) -> Iterator[str]:
         )
     if growth.lower is not None:
         end = ": unstable" if growth.lower > 1 else ""
-        ties = ", each update at one of two ticks," if growth.has_ties else ""
+        ties = " with each update at one of two ticks" if growth.has_ties else ""
         yield (
-            f"with {growth.losses} consecutive losses allowed, {growth.pattern}, repeated,{ties} changes the "
+            f"with {growth.losses} consecutive losses allowed, {growth.pattern}, repeated{ties}, changes the "
             f"loop's state at least by the factor {at_least(growth.lower)} {per}{end}"
         )
 

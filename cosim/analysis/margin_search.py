@@ -370,7 +370,14 @@ def find_margin(
     try:
         # M = 1, 2, … up to the first one that is destabilised, or that the other rules imply.
         for m in range(1, most_m + 1):
-            caps.append(LossCap(m, examine(capped(other_rules, m - 1), f"M = {m} of at most {most_m}")))
+            caps.append(
+                LossCap(
+                    m,
+                    examine(
+                        capped(other_rules, m - 1), f"at most {m - 1} lost in a row (up to {most_m - 1})"
+                    ),
+                )
+            )
             decided(caps[-1])
             every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
             if every_m or caps[-1].stability.verdict == "destabilised":

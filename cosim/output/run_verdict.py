@@ -83,6 +83,7 @@ def verdict(summary: RunSummary) -> tuple[Sentence, ...]:
             summary.reached_s,
             summary.horizon_s,
             "" if diverged and summary.exit.status == ExitStatus.FAILED else _states(loops),
+            has_grown=any(map(_grew, loops)),
         ),
         _guarantee_line(loops),
         transmission_line(events, deliveries, ideal),
@@ -133,9 +134,12 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
 
 def _grew(loop: LoopSummary) -> bool:
     """Return whether ‖x‖ diverged, or was much larger at the end than at the start."""
-    first, final = loop.initial_state_norm, loop.final_state_norm
-    grew = first is not None and final is not None and final > _MOST_GROWTH * first > 0
-    return loop.diverged_at_s is not None or grew
+    return loop.diverged_at_s is not None or _is_larger(loop.initial_state_norm, loop.final_state_norm)
+
+
+def _is_larger(first: float | None, final: float | None) -> bool:
+    """Return whether a norm was much larger at the end than at the start."""
+    return first is not None and final is not None and final > _MOST_GROWTH * first > 0
 
 
 def _with_unit(value: float | None, output: OutputPart) -> str:
@@ -148,20 +152,26 @@ def verdict_of_exact_run(summary: ContinuousSummary) -> list[Sentence]:
     if not failed:
         state = state_text(summary.initial_state_norm, summary.sup_state_norm, summary.final_state_norm, None)
     end = ExitPart(status=summary.exit_status, reason=summary.reason)
+    has_grown = _is_larger(summary.initial_state_norm, summary.final_state_norm)
     return [
-        ending_line(end, summary.reached_s, summary.horizon_s, state),
+        ending_line(end, summary.reached_s, summary.horizon_s, state, has_grown=has_grown),
         transmission_line(summary.events, summary.deliveries),
     ]
 
 
-def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str = "") -> Sentence:
-    """Return how a run ended, with the words of :func:`state_text` about its loops."""
+def ending_line(
+    end: ExitPart, reached_s: float, horizon_s: float, states: str = "", *, has_grown: bool = False
+) -> Sentence:
+    """Return how a run ended, with the words of :func:`state_text` about its loops.
+
+    A run to the horizon is good unless a loop's ‖x‖ has grown.
+    """
     length = f"{reached_s:g} s"
     length_of_horizon = f"{length} of {horizon_s:g} s"
     reason = "" if end.status == ExitStatus.OK and end.reason == HORIZON else end.reason
     says_when = reason.startswith("the plant failed at ")  # a simulation goes on to its horizon
     outcome, tone = {
-        ExitStatus.OK: (f"completed {length}", Tone.GOOD),
+        ExitStatus.OK: (f"completed {length}", Tone.DOUBTFUL if has_grown else Tone.GOOD),
         ExitStatus.FAILED: ("failed" if says_when else f"failed after {length_of_horizon}", Tone.BAD),
     }.get(ExitStatus(end.status), (f"stopped after {length_of_horizon}", Tone.DOUBTFUL))
     details = "; ".join(filter(None, (reason.removeprefix("stopped "), states)))
@@ -198,7 +208,7 @@ def state_text(
         if first is not None and largest > first and top != start:
             return f"{word}, {norm} was {start} at the start, at most {top}, at the end {final:.3g}"
         return f"{word}, {norm} fell from {top} to {final:.3g}"
-    if first is not None and final > _MOST_GROWTH * first > 0:
+    if first is not None and _is_larger(first, final):
         return f"{norm} grew from {first:.3g} to {final:.3g}, it was at most {largest:.3g}"
     return f"{word}, {norm} was at most {largest:.3g}, at the end {final:.3g}"
 

@@ -142,8 +142,8 @@ def resolve(scenario: Scenario) -> Scenario:
     """
     if (count := len(names := loop_names(scenario))) > 1:
         raise CallerError(
-            f"{scenario.name}: it has {count} loops, and this is for one: use --loop NAME if the command "
-            f"has it, else a scenario of one loop; they are {few_of(names)}"
+            f"{scenario.name}: the scenario has {count} loops, and this is for one: choose it with --loop "
+            f"NAME if the command has that option; they are {few_of(names)}"
         )
     return resolved_loops(scenario)[0]
 

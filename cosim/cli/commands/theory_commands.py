@@ -338,8 +338,9 @@ def margin(
     --play takes the scenario's horizon, or a longer one, up to 10 minutes, at which the growth of
     ‖x‖ shows, and prints what to expect.
 
-    Takes a second to ten for each M, and as long again for the period; minutes where the times of events
-    vary, as with a deadline. Each result is printed when it is known.
+    Takes a second of CPU time for each M. It takes up to 40 s for an M if an update may act at either of two
+    ticks (90 s for 14 values of M), and minutes if the times of events vary, as with a deadline. The search
+    for the longest period adds some seconds. Each result is printed when it is known.
     """
     from cosim.analysis.margin_search import find_margin
     from cosim.output.certificate_report import margin_document

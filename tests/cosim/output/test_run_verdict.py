@@ -82,6 +82,15 @@ def test_the_state_is_stable_bounded_or_diverged(
     assert state_text(first, largest, final, diverged_at_s) == text
 
 
+@pytest.mark.parametrize(("final", "tone"), [(0.1, Tone.GOOD), (9.0, Tone.GOOD), (31.0, Tone.DOUBTFUL)])
+def test_a_run_whose_state_grew_is_not_good(outcome: Outcome, final: float, tone: Tone) -> None:
+    grown = {"initial_state_norm": 3.0, "sup_state_norm": 31.0, "final_state_norm": final}
+    loops = [outcome.summary.loops[0].model_copy(update=grown)]
+    line = verdict(outcome.summary.model_copy(update={"loops": loops}))[1]
+    assert line.text.startswith("completed 20 s")
+    assert line.tone == tone
+
+
 def test_at_a_set_point_the_state_is_the_distance_from_it() -> None:
     scenario = noack.load("double_integrator", {"controller.setpoint": [3.0, 0.0]})
     summary = noack.simulate(scenario).summary
