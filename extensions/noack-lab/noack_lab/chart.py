@@ -21,7 +21,7 @@ _TITLE, _LINE, _PLOT, _GAP, _FOOT = 24, 25, 120, 30, 46
 """Heights in pixels: the title of a panel, a line of its legend, its axes, the times below them, the
 last axis with its name."""
 _LEFT, _RIGHT = 62, 14
-_CHARACTER, _KEY = 7.0, 42
+_CHARACTER, _KEY = 6.2, 42
 """Widths in pixels: a character of a legend, the sample and the gap of an entry."""
 _GAP_OF_ENTRIES = 10
 PHONE_PX = 366
