@@ -20,7 +20,15 @@ from cosim.output.figures.axes_parts import (
 )
 from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.figures.palette import Colour
-from cosim.output.figures.panels import Panels, add_colour_bar, character_in, columns, labels_in
+from cosim.output.figures.panels import (
+    BAR_IN,
+    Panels,
+    add_colour_bar,
+    character_in,
+    columns,
+    labels_in,
+    margins,
+)
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult, runs_at
 from cosim.studies.campaign.chunk_store import Store
@@ -130,7 +138,8 @@ def draw_heat_maps(
     is_log = METRICS[metric].logarithmic and _is_wide(finite)
     count, wide = len(maps), columns(figure, min(_MAPS_IN_A_ROW, len(maps)), _NARROWEST_MAP_IN)
     x_labels, y_labels = [*map(label_text, x[1])], [*map(label_text, y[1])]
-    cell_in = 0.7 * figure.get_figwidth() / wide / len(x_labels)
+    beside_in = max(margins(figure).left, labels_in(y_labels)) + 4 * BAR_IN  # and the colours' bar
+    cell_in = (figure.get_figwidth() - beside_in) / wide / len(x_labels)
     turned_in = max(map(len, x_labels)) * character_in()
     turned_in = turned_in / math.sqrt(2) if turned_in > cell_in else 0.0
     panels, mesh = [], None
