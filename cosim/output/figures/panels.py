@@ -169,8 +169,8 @@ def _draw_legends(figure: "Figure", row: Panels, spans: Sequence[tuple[float, fl
         title, lines, end = axes.get_title("left"), 0, row.axes[-1] if is_only else axes
         if handles:
             beside_in = (sum(spans[-1]) - left_in) if is_only else wide_in
-            count = _legend_columns([*handles], beside_in - _TITLE_CHARACTERS * character_in(), space)
-            if count < len(handles):
+            count, room_in = len(handles), beside_in - _TITLE_CHARACTERS * character_in()
+            if sum(_legend_widths_in([*handles], space)) > room_in:
                 count = _legend_columns([*handles], width_in - 2 * space.right, space)
                 lines = -(-len(handles) // count)
             axes.legend(
@@ -194,9 +194,14 @@ def _legend_entries(axes: "Axes", space: Margins) -> dict[str, "Artist"]:
     return entries
 
 
+def _legend_widths_in(labels: Sequence[str], space: Margins) -> list[float]:
+    """Return the widths of the entries of a legend."""
+    return [space.handle + character_in() * len(_MARKUP.sub("", label)) for label in labels]
+
+
 def _legend_columns(labels: Sequence[str], room_in: float, space: Margins) -> int:
     """Return the largest number of columns for which there is room; entries go down the columns."""
-    widths_in = [space.handle + character_in() * len(_MARKUP.sub("", label)) for label in labels]
+    widths_in = _legend_widths_in(labels, space)
     for count in range(len(labels), 1, -1):
         if sum(column.max() for column in np.array_split(widths_in, count)) <= room_in:
             return count

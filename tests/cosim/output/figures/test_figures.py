@@ -9,6 +9,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 
 import noack
@@ -16,7 +17,7 @@ from cosim.analysis.summary.quantiles import QuantileSketch
 from cosim.output.curves import DASHED, ERRORS, INPUT, STATE_NORM, Curve, CurveStyle, state_curves
 from cosim.output.figures import axes_parts, palette
 from cosim.output.figures.figure_files import save_figure, save_figures
-from cosim.output.figures.figure_format import requested_files
+from cosim.output.figures.figure_format import PHONE_IN, SCREEN_IN, requested_files
 from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.figures.run_figures import Transmissions, draw_norms, draw_states, run_curves, run_figures
 from cosim.output.figures.timing_figures import later_than
@@ -207,3 +208,20 @@ def test_the_curves_of_a_run_are_those_of_its_figures(case: str) -> None:
     assert all(curve.t_s.shape == curve.values.shape for curve in curves)
     sent = sum(len(curve.t_s) for curve in curves if curve.name in ("delivered", "lost"))
     assert sent == len(record.events())
+
+
+@pytest.mark.parametrize("entries", [1, 2])
+@pytest.mark.parametrize("width_in", [PHONE_IN, SCREEN_IN])
+def test_a_long_legend_is_below_the_title(entries: int, width_in: float) -> None:
+    def draw(axes: Axes) -> None:
+        axes.set_title("Inter-event times")
+        for number in range(entries):
+            axes.plot([0, 1], label=f"{number}: certified for a plant by its equations")
+
+    figure = one_panel("one", 2.0, draw).draw(width_in)
+    (axes,), renderer = figure.axes, FigureCanvasAgg(figure).get_renderer()
+    legend = axes.get_legend()
+    assert legend is not None
+    title = axes._left_title  # type: ignore[attr-defined]
+    assert not legend.get_window_extent(renderer).overlaps(title.get_window_extent(renderer))
+    assert legend.get_window_extent(renderer).x0 >= 0
