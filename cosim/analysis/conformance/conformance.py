@@ -227,31 +227,32 @@ class _Checked:
             rest = then - now @ moved[:, :n].T - inputs @ moved[:, n : n + m].T
             scale = np.abs(now) @ np.abs(split.F).T + np.abs(inputs) @ np.abs(split.B).T
             allowed = MOTION * length * scale + STATE * 1e-3 * np.abs(then) + _TINY * self._size()
-            rest = np.maximum(np.abs(rest) - allowed, 0) * np.sign(rest)
             changes = min(float(np.linalg.norm(split.F, 2)) * length, 0.5)  # of a signal's effect in a step
             columns = moved[self._states, n + m :]
-            explained = self._explained(rest[:, self._states], columns, split, now, then, changes)
+            free = allowed[:, self._states] + changes * np.abs(rest).max(axis=1, initial=0)[:, None] * bool(
+                columns.size
+            )
+            explained = self._explained(rest[:, self._states], free, columns, split, now, then)
             self._require(here, explained, f"{name!r}: no motion of the document leads to what was recorded")
 
     def _explained(
-        self, rest: Vector, columns: Matrix, split: _Split, now: Vector, then: Vector, changes: float
+        self, rest: Vector, free: Vector, columns: Matrix, split: _Split, now: Vector, then: Vector
     ) -> Vector:
-        """Return which rests are Σ column p with |p| ≤ |Rz|.
+        """Return which rests are Σ column p with |p| ≤ |Rz|, but for what is ``free``.
 
-        Signals may vary during a step. So |Rz| is the larger one of both ends, plus what it changes by; and a
-        share of the effect may be left, at most ``changes``.
+        Signals may vary during a step: |Rz| is the larger one of both ends, plus what it changes by.
         """
         if not columns.shape[1]:
-            return ~rest.any(axis=1)
+            return np.asarray((np.abs(rest) <= free).all(axis=1))
         sizes = [[np.linalg.norm(z @ R.T, axis=1) for z in (now, then, then - now)] for R in split.rows]
         limits = np.stack([np.maximum(first, last) + change for first, last, change in sizes])
         # Signals with parallel columns add up; the directions that are left are independent.
         directions, groups = _directions(columns)
         reach = np.stack([np.abs(factors) @ limits[list(which)] for which, factors in groups])
         needed, *_ = np.linalg.lstsq(directions, rest.T, rcond=None)
-        left = rest.T - directions @ needed
-        small = np.abs(left).max(axis=0) <= changes * np.abs(rest).max(axis=1) + _TINY * self._size()
-        return small & (np.abs(needed) <= reach * (1 + MOTION) + _TINY * self._size()).all(axis=0)
+        small = (np.abs(rest.T - directions @ needed) <= free.T).all(axis=0)
+        room = free.max(axis=1) / np.linalg.norm(directions, axis=0).min()
+        return np.asarray(small & (np.abs(needed) <= reach + room).all(axis=0))
 
     def _inputs(self, name: str, split: _Split, at: Vector) -> None:
         u = self._trace.u[np.array(self._trace.steps)[at]]
