@@ -21,6 +21,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
 from noack.runtime.command_line import StopRequestError
+from noack.scenario.arrival_ties import late_inputs
 from noack.scenario.scenario import Scenario
 from noack.theory.random_losses.mean_square_growth import MeanSquareGrowth, growth_without_guarantee
 from noack.theory.witnesses.growth import ACCURACY
@@ -227,6 +228,8 @@ class MarginResult:
     """The scenario's guarantee and others, if there are others."""
     ties: str = ""
     """Which order of an update and a tick is not known, in words."""
+    late_inputs: str = ""
+    """That an input may miss a step of the plant, in words; this is not covered."""
     missing: tuple[str, ...] = ()
     """What was not examined, in words, because the search was stopped."""
 
@@ -276,9 +279,20 @@ class MarginResult:
         """Return the verdicts."""
         period = [self.period.text] if self.period else []
         proof = [] if self.proof is None else self.proof.lines
-        ties = [self.ties] if self.ties else []
-        texts = [self.verdict, *ties, *proof, *self.compared.relations, *period, self.random_text]
+        texts = [
+            self.verdict,
+            *self.timing_texts,
+            *proof,
+            *self.compared.relations,
+            *period,
+            self.random_text,
+        ]
         return "\n".join([*texts, *self.certificate_texts])
+
+    @property
+    def timing_texts(self) -> list[str]:
+        """What a live run may do at times that are nominally the same, in words."""
+        return [text for text in (self.ties, self.late_inputs) if text]
 
     @property
     def random_text(self) -> str:
@@ -418,6 +432,7 @@ def find_margin(
         effort=effort,
         compared=compared,
         ties=margin.ties,
+        late_inputs=late_inputs(resolved),
         missing=tuple(f"M from {len(caps) + 1} on" if what == _CAPS else what for what in missing),
     )
 

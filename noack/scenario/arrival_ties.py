@@ -1,53 +1,106 @@
 """Updates that arrive at a tick of the controller, or shortly before it: which tick they act at.
 
-In a live run an update takes some 0.1 ms longer than its nominal delay. So a simulation, which has nominal
-times, lets such an update arrive just after the tick.
+In a live run an update takes some 0.1 ms longer than its nominal delay, and so does an input. So a
+simulation, which has nominal times, lets such an update arrive just after the tick.
 """
 
+from collections.abc import Sequence
 from fractions import Fraction
 from math import floor, gcd
 
 from noack.core.clock import NS_PER_S
+from noack.impairments.feature import Impairment
 from noack.impairments.kinds.delay import Delay
-from noack.scenario.resolution import ResolvedRun, resolve
+from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario import Scenario
 
 LATENCY_NS = 200_000
 """What is nominally so near may come in either order in a live run."""
+WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
+"""Kinds of impairments that do not change the delay of a packet."""
+_US = 1000
+"""In ns; the later delay is a whole number of µs, as a fraction of a second with few digits."""
+_MOST_RAISES = 100
+"""Each raise passes a tick of one loop; another loop may have one just after it."""
 
 
 def with_later_updates(scenario: Scenario) -> tuple[Scenario, str]:
     """Return a scenario whose updates act at the later of two ticks, and in a sentence what was changed.
 
-    The sentence is empty, and the scenario the same, if no constant delay ends at a tick.
+    The sentence is empty, and the scenario the same, if no update ends its constant delay at a tick. The
+    loops of a run have one network, so that all of them get the same delay.
     """
-    if len(ResolvedRun(scenario).names) > 1:  # loops on one network have their own ticks
-        return scenario, ""
-    resolved = resolve(scenario)
-    stages = resolved.network.impairments
+    stages = scenario.network.impairments
     delays = [stage for stage in stages if isinstance(stage, Delay)]
-    if not delays or any(stage.jitter_s or stage.samples_s or stage.file for stage in delays):
+    is_constant = not any(stage.jitter_s or stage.samples_s or stage.file for stage in delays)
+    if not is_constant or any(stage.kind not in ("delay", *WITHOUT_DELAY) for stage in stages):
         return scenario, ""
-    later_ns = _until_after_tick_ns(resolved, sum(round(stage.delay_s * NS_PER_S) for stage in delays))
-    if not later_ns:
+    loops = [entry.scenario for entry in ResolvedRun(scenario).entries]
+    last = delays[-1] if delays else Delay()
+    nominal_ns = round(last.delay_s * NS_PER_S)
+    others_ns = sum(round(stage.delay_s * NS_PER_S) for stage in delays[:-1])
+    later_ns = _later_ns(loops, nominal_ns, others_ns)
+    if later_ns == nominal_ns:
         return scenario, ""
-    place = stages.index(delays[-1])
-    delay_s = (round(delays[-1].delay_s * NS_PER_S) + later_ns) / NS_PER_S
-    changed = list(scenario.network.impairments)
-    changed[place] = delays[-1].model_copy(update={"delay_s": delay_s})
-    network = scenario.network.model_copy(update={"impairments": tuple(changed)})
+    delay_s = later_ns / NS_PER_S
+    network = scenario.network.model_copy(update={"impairments": _delayed(stages, last, delay_s)})
     text = (
         f"an update may arrive at a tick of the controller, or up to {LATENCY_NS / 1e6:g} ms before: a live "
-        f"run may use it at this tick or at the next one, here it is the next one (delay_s = {delay_s:.9f})"
+        f"run may use it at this tick or at the next one, here it is the next one (delay_s = {delay_s:.6f})"
     )
     return scenario.model_copy(update={"network": network}), text
 
 
-def _until_after_tick_ns(resolved: Scenario, delay_ns: int) -> int:
+def late_inputs(scenario: Scenario) -> str:
+    """Return in a sentence that inputs may miss a step of the plant.
+
+    The sentence is empty if none is computed shortly before a step. What is computed at a step acts at
+    the next one, in every run.
+    """
+    if scenario.network.actuation is not None:
+        return ""
+    for entry in ResolvedRun(scenario).entries:
+        timing = entry.scenario.timing
+        phase, step = timing.exact_controller_phase, timing.plant_period.exact
+        if 0 < _until_next(phase, timing.controller_period.exact, step) <= LATENCY_NS:
+            return (
+                f"an input may be computed up to {LATENCY_NS / 1e6:g} ms before a step of the plant: it is "
+                "assumed to act at this step; in a live run it may act at the next one"
+            )
+    return ""
+
+
+def _delayed(stages: Sequence[Impairment], last: Delay, delay_s: float) -> tuple[Impairment, ...]:
+    """Return the stages with another delay in the place of the last one; without one, at the end."""
+    changed = last.model_copy(update={"delay_s": delay_s})
+    if last not in stages:
+        return (*stages, changed)
+    return tuple(changed if stage is last else stage for stage in stages)
+
+
+def _later_ns(loops: Sequence[Scenario], delay_ns: int, others_ns: int) -> int:
+    """Return a delay with which the updates of all loops miss the ticks that are near their arrivals.
+
+    Other delays come before this one.
+    """
+    for _ in range(_MOST_RAISES):
+        raise_ns = max(_until_after_tick_ns(loop, others_ns + delay_ns) for loop in loops)
+        if not raise_ns:
+            break
+        delay_ns = -(-(delay_ns + raise_ns) // _US) * _US
+    return delay_ns
+
+
+def _until_after_tick_ns(loop: Scenario, delay_ns: int) -> int:
     """Return by how much later updates miss a tick which is near their arrival; 0 if none is."""
-    timing = resolved.timing
-    sample, tick = timing.measurement_period.exact, timing.controller_period.exact
-    unit = sample.denominator * tick.denominator
-    common = Fraction(gcd(int(sample * unit), int(tick * unit)), unit)
-    until_tick = (timing.exact_controller_phase - delay_ns) % common  # the least of all updates
+    timing = loop.timing
+    arrival = Fraction(delay_ns) - timing.exact_controller_phase
+    until_tick = _until_next(arrival, timing.measurement_period.exact, timing.controller_period.exact)
     return floor(until_tick) + 1 if until_tick <= LATENCY_NS else 0
+
+
+def _until_next(first: Fraction, period: Fraction, other: Fraction) -> Fraction:
+    """Return the least time from one of first, first + period, … to a later multiple of another period."""
+    unit = period.denominator * other.denominator
+    common = Fraction(gcd(int(period * unit), int(other * unit)), unit)
+    return -first % common

@@ -5,13 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cosim.analysis.mean_cost import find_mean_cost
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
-from noack.protocol.record_tables import PLANT_STEP
+from noack.impairments.target_loss import loss_process
+from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.scenario import arrival_ties
-from noack.scenario.arrival_ties import with_later_updates
+from noack.scenario.arrival_ties import late_inputs, with_later_updates
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
+from noack.theory.random_losses.mean_square_growth import growth_without_guarantee
 from noack.theory.witnesses.growth import enclose_growth
 from noack.theory.witnesses.loss_margin import LossMargin, capped
 from noack_check.check import RejectedError
@@ -84,7 +87,7 @@ def test_a_simulation_takes_the_later_tick_and_says_so() -> None:
     scenario, text = with_later_updates(load(CASE, ["horizon_s=1.0"]))
     assert text == (
         "an update may arrive at a tick of the controller, or up to 0.2 ms before: a live run may use it at "
-        "this tick or at the next one, here it is the next one (delay_s = 0.025000001)"
+        "this tick or at the next one, here it is the next one (delay_s = 0.025001)"
     )
     later = load(CASE, ["horizon_s=1.0", LATER])
     same, nothing = with_later_updates(later)
@@ -93,3 +96,82 @@ def test_a_simulation_takes_the_later_tick_and_says_so() -> None:
     np.testing.assert_array_equal(*runs)
     early = simulate(resolve(load(CASE, ["horizon_s=1.0"])))[PLANT_STEP]["u"]
     assert not np.array_equal(early, runs[0])
+
+
+AT_ONCE = ("network.impairments=[]", "controller.phase=0.0")
+"""Nothing is delayed, and each packet is sent at a tick."""
+
+
+@pytest.mark.parametrize(
+    ("phase", "delay_s"),
+    [(0.5, 0.025001), (0.50005, 0.025001), (0.5001, 0.025002), (0.4, 0.025001)],
+)
+def test_every_loop_of_a_run_takes_the_later_tick(phase: float, delay_s: float) -> None:
+    """Also where the delay of all loops, beyond the tick of one, is at the tick of another."""
+    second = f'{{name="second", phase=0.3, controller={{phase={phase}}}}}'
+    given = load(CASE, [f'loops=[{{name="first", phase=0.0}}, {second}]', "horizon_s=0.3"])
+    scenario, text = with_later_updates(given)
+    assert "here it is the next one" in text
+    assert with_later_updates(scenario) == (scenario, "")
+    assert [stage.content()["delay_s"] for stage in scenario.network.impairments] == [delay_s]
+
+
+def test_an_update_without_delay_misses_a_tick_at_its_transmission() -> None:
+    scenario, _ = with_later_updates(load(CASE, [*AT_ONCE, "horizon_s=0.3"]))
+    assert with_later_updates(scenario) == (scenario, "")
+    assert [stage.content()["delay_s"] for stage in scenario.network.impairments] == [1e-6]
+    early, later = (simulate(resolve(each)) for each in (load(CASE, [*AT_ONCE, "horizon_s=0.3"]), scenario))
+    inputs = [run[CONTROLLER_STEP]["u"][:, 0] for run in (early, later)]
+    assert inputs[0][0] != 0
+    assert inputs[1][0] == 0
+    assert inputs[1][1] == inputs[0][0]
+
+
+def test_delays_that_vary_have_no_ties() -> None:
+    for stages in ('{kind="delay", delay_s=0.025, jitter_s=0.001}', '{kind="rate", rate_bps=1000000}'):
+        scenario = load(CASE, [f"network.impairments=[{stages}]", "controller.phase=0.0"])
+        assert with_later_updates(scenario) == (scenario, "")
+
+
+@pytest.mark.parametrize("settings", [(), AT_ONCE])
+def test_mean_square_growth_and_cost_are_those_of_the_later_tick(settings: tuple[str, ...]) -> None:
+    nominal = load(CASE, list(settings))
+    later = resolve(with_later_updates(nominal)[0])
+    losses = loss_process(later.network.link)
+    growths = [growth_without_guarantee(each, losses) for each in (resolve(nominal), later)]
+    assert growths[0].per_period == growths[1].per_period
+    assert "each update at the later of its ticks" in growths[0].text
+    assert "each update at the later of its ticks" not in growths[1].text
+    computed = find_mean_cost(later).without_guarantee
+    assert computed.growth == pytest.approx(growths[0].per_period, rel=1e-6)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_late"),
+    [
+        ((), False),
+        (("controller.phase=0.49",), True),
+        (("controller.phase=0.51",), False),
+        (("plant.rate_hz=10000", "plant.measure_every=100", "controller.phase=0.505"), True),
+        (("plant.rate_hz=10000", "plant.measure_every=100"), False),
+        (('network.actuation={mansd=1, loss={model="lossless"}}', "controller.phase=0.49"), False),
+    ],
+)
+def test_inputs_shortly_before_a_step_of_the_plant_are_named(
+    settings: tuple[str, ...], is_late: bool
+) -> None:
+    assert bool(late_inputs(load(CASE, list(settings)))) == is_late
+
+
+@pytest.mark.parametrize(("losses", "safe_ms"), [(1, []), (2, [145.0]), (3, [145.0, 155.0])])
+def test_updates_expire_after_two_losses(losses: int, safe_ms: list[float]) -> None:
+    """The age at a tick is nominal, so a timeout that is equal to it acts, live as well.
+
+    The update of 90 ms misses the tick at 115 ms, acts from that at 125 ms on, and is 55 ms old at 145 ms.
+    """
+    script = f"network.loss={{model='scripted', lost={list(range(10, 10 + losses))}}}"
+    nominal = load(CASE.with_name("drive_timeout.toml"), [script, "horizon_s=0.3"])
+    rows = simulate(resolve(with_later_updates(nominal)[0]))[CONTROLLER_STEP]
+    times_ms = rows["t_ns"] / 1e6
+    is_safe = (rows["u"][:, 0] == 0) & (times_ms > 60)
+    assert times_ms[is_safe].tolist() == safe_ms

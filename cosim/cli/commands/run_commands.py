@@ -117,15 +117,15 @@ def simulate(
     from cosim.live.monitoring.progress import error_console, simulation_bar
     from cosim.simulation.virtual_time import simulate_run
     from noack.runtime.command_line import print_to_stderr
-    from noack.scenario.arrival_ties import with_later_updates
+    from noack.scenario.arrival_ties import late_inputs, with_later_updates
 
     loaded = opt.load_scenario(scenario, settings, network)
     warn_of_violations(loaded, is_sampled=trigger is opt.TriggerMode.SAMPLED)
     if trigger is opt.TriggerMode.CONTINUOUS:
         return simulate_continuously(loaded, json=json, required=require or ())
     loaded, tie = with_later_updates(loaded)
-    if tie:
-        print_to_stderr(f"noack: {tie}")
+    for line in filter(None, (tie, late_inputs(loaded))):
+        print_to_stderr(f"noack: {line}")
     with simulation_bar(error_console()) as bar:
         ending = simulate_run(loaded, runs, bar)
     return finalize_run(ending, report=report, verbose=verbose, json=json, required=require or ())

@@ -417,12 +417,12 @@ def cost(
     from cosim.analysis.mean_cost import find_mean_cost
     from cosim.cli.cost_weights import given_weight
     from cosim.output.certificate_report import mean_cost_document
-    from noack.scenario.arrival_ties import with_later_updates
+    from noack.scenario.arrival_ties import late_inputs, with_later_updates
     from noack.scenario.resolution import resolve
 
     settled, tie = with_later_updates(opt.load_loop(scenario, settings, loop, network))
-    if tie:
-        print_to_stderr(f"noack: {tie}")
+    for line in filter(None, (tie, late_inputs(settled))):
+        print_to_stderr(f"noack: {line}")
     resolved = resolve(settled)
     costs = find_mean_cost(resolved, given_weight(Q), given_weight(R))
     show(mean_cost_document(costs), json=json, tables=tables)

@@ -119,6 +119,7 @@ class NetworkSearch:
         self.measurements, self._loop = margin.longest, margin.loop
         """From an update to the next one."""
         self._times = loop_times(resolved, margin.longest)
+        self._latest = [max(self._loop.times.arrivals(slot)) for slot in range(self._times.slots)]
         self.period_s = margin.seconds(margin.longest)
         if margin.shortest < margin.longest:
             raise CallerError(
@@ -147,7 +148,7 @@ class NetworkSearch:
         H = plant.A_model + plant.B_model @ gain
         if self.scenario.mode == "zoh":
             H = np.zeros_like(H)
-        return QuickLoop((plant.A, plant.B, gain, H), self._times, self.weights)
+        return QuickLoop((plant.A, plant.B, gain, H), self._times, self.weights, self._latest)
 
     def _new_graph(self, m: int) -> PatternGraph:
         """Return the loss patterns for an M, which keep those that were the worst."""

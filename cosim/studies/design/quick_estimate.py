@@ -45,6 +45,8 @@ class QuickLoop:
         matrices: A, (n, n), B, (n, m), K, (m, n), and H, (n, n).
         times: the times of the loop.
         weights: Q and R, the weights of x and u in the cost.
+        latest: for every slot, how long after a transmission an update arrives at the latest; by default
+            the delay. The cost is that of the latest arrivals.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class QuickLoop:
         matrices: tuple[Matrix, Matrix, Matrix, Matrix],
         times: LoopTimes,
         weights: tuple[Matrix, Matrix],
+        latest: Sequence[int] = (),
     ) -> None:
         A, B, K, H = matrices
         n, m = B.shape
@@ -66,12 +69,14 @@ class QuickLoop:
         occurrences = [(x, x_c, w, w), (x, x_c, u, K @ x_c), (x, x_c, u, without_update)]
         steps = (_Map(np.vstack([*rows, *older]), np.zeros((size, size))) for rows in occurrences)
         self._between = Timeline(times, self._exponential, *steps).between
-        self._x_c, self._arrived = slice(n, 2 * n), expm(H * times.seconds(times.whole_delay)) @ sent[-1]
+        self._latest = latest or [times.delay] * times.slots
+        self._x_c, self._H, self._oldest = slice(n, 2 * n), H, sent[-1]
         self._shifted = np.vstack([np.zeros((0, size)), *sent[:-1]])
         self._none = _Map(np.eye(size), np.zeros((size, size)))
         self._lost, self._delivered = cache(self._lost_period), cache(self._delivered_period)
+        self._arrived = cache(self._state_on_arrival)
         self._z = np.eye(size), np.eye(size)
-        if not times.whole_delay:  # just after a delivery x_c = x and w = u
+        if times.behind + max(self._latest) == 0:  # just after a delivery x_c = x and w = u
             self._z = np.vstack([x, u]), np.vstack([x, x, u, u]) @ np.vstack([x, u]).T
 
     def _exponential(self, dt: int) -> _Map:
@@ -87,14 +92,19 @@ class QuickLoop:
         begin = slot * self.times.period
         return self._shift(self._between(begin, begin + self.times.period, begin + usable))
 
-    def _delivered_period(self, slot: int, usable: int) -> _Map:
+    def _state_on_arrival(self, delay: int) -> Matrix:
+        """Return the rows of x_c after an update that arrives so long after a transmission."""
+        whole_delay = self.times.behind * self.times.period + delay
+        return expm(self._H * self.times.seconds(whole_delay)) @ self._oldest
+
+    def _delivered_period(self, slot: int, usable: int, delay: int) -> _Map:
         """Return the map of a period with an arrival; x_c before it is used for some time."""
         begin = slot * self.times.period
-        end, arrival = begin + self.times.period, begin + self.times.delay
+        end, arrival = begin + self.times.period, begin + delay
         first = self._between(begin, arrival, begin + usable)
         second = self._between(arrival, end, begin + self.times.timeout)
         M = first.M.copy()
-        M[self._x_c] = self._arrived
+        M[self._x_c] = self._arrived(delay)
         return self._shift(_Map(M, first.C).then(second))
 
     def _shift(self, period: _Map) -> _Map:
@@ -109,14 +119,15 @@ class QuickLoop:
         The controller knows x(0), and the input is 0 until its first tick.
         """
         times = self.times
-        usable = times.usable(1, times.delay)
+        usable = times.usable(1, max(self._latest))
         before = reduce(
             _Map.then,
             (self._lost(slot % times.slots, times.period) for slot in range(times.behind)),
             self._none,
         )
         slots = range(times.behind, times.behind + times.slots)
-        whole = reduce(_Map.then, (self._delivered(slot % times.slots, usable) for slot in slots))
+        periods = (slot % times.slots for slot in slots)
+        whole = reduce(_Map.then, (self._delivered(slot, usable, self._latest[slot]) for slot in periods))
         if not np.isfinite([whole.M, whole.C]).all() or not spectral_radii(whole.M) < 1 - 1e-9:
             return np.inf
         z0 = np.zeros(len(whole.M))
@@ -129,7 +140,8 @@ class QuickLoop:
         """Return the maps of bursts between two deliveries, (k, d, d)."""
         (rows, start), times, maps = self._z, self.times, []
         for burst in bursts:
-            M = self._delivered(burst.slot, burst.usable).M @ start
+            arrival = times.delay if burst.arrival is None else burst.arrival
+            M = self._delivered(burst.slot, burst.usable, arrival).M @ start
             for number in range(1, burst.losses + 1):
                 usable = times.usable(number, times.period)
                 M = self._lost((burst.slot + number) % times.slots, usable).M @ M

@@ -25,6 +25,7 @@ from noack.core.linear_systems import Matrix, Stack, Vector, balancing_exponents
 from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
+from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.time_triggered.exact_matrices import IntervalMatrix, exactly, inverse
@@ -54,6 +55,8 @@ class MeanSquareGrowth(NamedTuple):
 
     per_period: float
     """Upper bound of the growth of √(E‖z‖²) per period, exact up to 1e-6."""
+    has_ties: bool = False
+    """Whether updates arrive at ticks of the controller; each then acts at the next one."""
 
     @property
     def text(self) -> str:
@@ -61,7 +64,7 @@ class MeanSquareGrowth(NamedTuple):
         verdict = "stable" if self.per_period < 1 else "not stable"
         return (
             f"√E‖z‖² of the loop's state z changes by the factor {self.per_period:.6g} per period: "
-            f"{verdict} in mean square (computed)"
+            f"{verdict} in mean square (computed{', each update at the later of its ticks' * self.has_ties})"
         )
 
 
@@ -72,6 +75,7 @@ def growth_without_guarantee(resolved: Scenario, losses: LossProcess) -> MeanSqu
         NotPredictableError: loop and losses have too many states, or the sensor is not
             time-triggered.
     """
+    resolved, tie = with_later_updates(resolved)
     between = intervals(resolved)
     if len(between) > 1:
         raise NotPredictableError("the times between updates are not known")
@@ -84,7 +88,7 @@ def growth_without_guarantee(resolved: Scenario, losses: LossProcess) -> MeanSqu
         maps = [(exact.period(slot, True), exact.period(slot, False)) for slot in range(times.slots)]
     except OverflowError:
         raise NotPredictableError("the loop grows beyond 1e308 within a period") from None
-    return MeanSquareGrowth(mean_square_growth(maps, losses.outcomes(LossGuarantee())))
+    return MeanSquareGrowth(mean_square_growth(maps, losses.outcomes(LossGuarantee())), bool(tie))
 
 
 def require_few_slots(times: LoopTimes) -> None:

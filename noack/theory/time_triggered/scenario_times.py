@@ -12,6 +12,7 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
+from noack.scenario.arrival_ties import WITHOUT_DELAY
 from noack.scenario.resolution import rule_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.coverage import require_exact
@@ -19,8 +20,6 @@ from noack.theory.time_triggered.time_triggered_loop import NEVER, LoopTimes
 
 _MOST_ON_THEIR_WAY = 40
 """Most updates on their way at once, times the number of states: the size of what is followed."""
-_WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
-"""Kinds of impairments that do not change the delay of a packet."""
 
 
 def require_covered(resolved: Scenario) -> None:
@@ -140,7 +139,7 @@ def update_delay_ns(resolved: Scenario) -> Fraction:
         )
         if isinstance(impairment, Delay) and constant:
             delay_ns += resolved.timing.exact_time(impairment.delay_s, impairment.constant_ns)
-        elif impairment.kind not in _WITHOUT_DELAY:
+        elif impairment.kind not in WITHOUT_DELAY:
             raise CallerError(
                 f"network.impairments.{number}: {impairment.kind}: this needs a constant "
                 "delay; use delay_s alone"
