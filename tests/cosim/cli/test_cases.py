@@ -1,10 +1,12 @@
 """Small inputs that once had a wrong answer, each on the command line."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
+from noack_check.__main__ import main as check
 from tests.helpers.command_line import invoke
 
 CASES = Path(__file__).parents[2] / "cases"
@@ -15,7 +17,7 @@ def words_of(text: str) -> str:
     return " ".join(text.split())
 
 
-def test_a_margin_names_the_ties_and_plays_no_pattern() -> None:
+def test_a_margin_names_the_ties() -> None:
     """13 losses are proven with early arrivals alone, and are false of a live run."""
     result = invoke("margin", CASES / "drive_tie.toml", "--most", "2")
     text = words_of(result.stdout)
@@ -24,6 +26,15 @@ def test_a_margin_names_the_ties_and_plays_no_pattern() -> None:
     assert "arrives within 0.2 ms of a tick of the controller: it may act at this tick or at the next" in text
     assert "no pattern, at whichever of two ticks each update acts, changes the loop's state" in text
     assert "stable in mean square (computed, each update at the later of its ticks)" in text
+
+
+def test_no_run_plays_a_pattern_whose_ticks_it_cannot_choose() -> None:
+    delay = 'network.impairments=[{kind="delay", delay_s=0.005}]'
+    unstable = ("--set", "model.gain=[[-0.5, 0.0, 0.6]]", "--set", delay)
+    result = invoke("margin", CASES / "drive_tie.toml", "--most", "1", "--play", *unstable)
+    assert result.exit_code != 0
+    assert "this pattern destabilises M = 1" in words_of(result.stdout)
+    assert "noack: --play: no run can choose the ticks of the pattern: an update arrives" in result.stderr
 
 
 def test_cost_and_simulation_name_the_tick(tmp_path: Path) -> None:
@@ -83,3 +94,31 @@ def test_a_damaged_file_of_matrices_is_refused() -> None:
     result = invoke("check", CASES / "segv.toml")
     assert result.exit_code != 0
     assert result.stderr.endswith('model.file = "segv.mat": is not a .mat file, or is damaged\n')
+
+
+def test_a_bound_above_the_start_is_called_no_guarantee(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An open loop of a drive with limited voltage is bounded by itself; more is not proven."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(CASES / "clipped_drive.py", tmp_path)
+    result = invoke("new", "clipped_drive.py", "--out", "drive.toml")
+    text = words_of(result.output)
+    assert result.exit_code == 0
+    assert "no guarantee of the allowed error: speed stays within 47" in text
+    assert (
+        "is not smaller than its value at the start, 50 rad/s: it says only that speed stays bounded" in text
+    )
+
+
+def test_a_name_that_reads_like_a_statement_is_quoted(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["noack-check", str(CASES / "spoof_name.json")])
+    check()
+    lines = capsys.readouterr().out.splitlines()
+    name = "lane_following, its plant, its schedule: ‖x‖ ≤ 0.001 e^(−9 t). Copy of g43"
+    proved = [line for line in lines if line.startswith("PROVED")]
+    assert len(proved) == 11
+    assert all(line.startswith(f'PROVED "{name}", its plant, ') for line in proved)
+    assert all(line.startswith("       if there are ") for line in lines if line not in proved)
