@@ -302,7 +302,9 @@ class Campaign(ScenarioSection):
         if self.metrics.output is None and "output_largest" in self._used_metrics():
             raise ValueError("metrics.output: missing; output_largest needs the name of an output or state")
         if self.metrics.output is not None and self.time != "sampled":
-            raise ValueError('metrics.output: needs time = "sampled"')
+            raise ValueError(
+                'metrics.output: is measured at steps of the plant, so it needs time = "sampled"'
+            )
         size = math.prod(len(axis.labels) for axis in self.axes)
         if size > MOST_POINTS:
             raise ValueError(f"axes: the grid has {size} points; at most {MOST_POINTS} are allowed")
