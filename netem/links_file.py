@@ -13,7 +13,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import read_files
 from noack.runtime.address import parse_address, parse_destination
 from noack.scenario import toml_file
-from noack.settings.section import ScenarioSection, Seed, Table
+from noack.settings.section import FolderName, ScenarioSection, Seed, Table
 
 
 def _settings(value: object) -> LinkSettings:
@@ -34,7 +34,7 @@ Side = Annotated[LinkSettings, BeforeValidator(_settings, json_schema_input_type
 class LinkTable(ScenarioSection):
     """One link of a relay: its addresses, and its settings in each direction."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+    name: FolderName
     """Names the link in reports: letters, digits, _ and -."""
     listen: str
     """Where clients send to: HOST:PORT; port 0 takes a free one."""

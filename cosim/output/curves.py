@@ -26,8 +26,9 @@ DASHES: tuple[Dash, ...] = (SOLID, (6, 1.5), (2, 1.2), (6, 1.5, 1.5, 1.5))
 """Dashes that distinguish series in addition to their colours."""
 
 ERRORS, STATE_NORM, INPUT, INTERVALS = "error norms", "norm of the state", "input", "inter-event time"
-"""Panels; that of a state has the state's name."""
+"""Panels; that of a state has the state's name, or ``state NAME`` if another panel may be called so."""
 
+_STATE = "state "
 BoundKind = Literal["certified", "identity", "printed"]
 """Source of a bound: a certificate, identity (I1), or ("printed") a formula of the paper."""
 _BOUND_STYLES: dict[BoundKind, tuple[Colour, tuple[Dash, ...]]] = {
@@ -114,11 +115,17 @@ def state_curves(
         ("x_r reference", x_r, CurveStyle(THRESHOLD, 1.2, (4, 2))),
     ]
     return [
-        Curve(panel, name, units[i] if units else "", t_s, states[:, i], style)
-        for i, panel in enumerate(names)
+        Curve(_panel_of_state(state), name, units[i] if units else "", t_s, states[:, i], style)
+        for i, state in enumerate(names)
         for name, states, style in sources
         if states is not None
     ]
+
+
+def _panel_of_state(name: str) -> str:
+    """Return the name of a state, or another one if a panel of something else may have this name."""
+    is_of_others = name in (ERRORS, STATE_NORM, INPUT, INTERVALS) or name.startswith((DISTANCE, _STATE))
+    return f"{_STATE}{name}" if is_of_others else name
 
 
 def output_curves(output: LoopOutput, t_s: Vector, distance: Vector) -> list[Curve]:

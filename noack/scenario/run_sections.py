@@ -6,7 +6,7 @@ from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.scenario.runtime_parameters import full_key
-from noack.settings.section import ScenarioSection, Seed, Table
+from noack.settings.section import FolderName, ScenarioSection, Seed, Table
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 
@@ -116,7 +116,6 @@ class RealtimeSection(ScenarioSection):
     core."""
 
 
-NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 MOST_LOOPS = 65_535
 """Largest number of loops in a run: datagrams carry the loop's number in 16 bits."""
 SHARED = (
@@ -147,7 +146,7 @@ class LoopSection(ScenarioSection):
     ``controller.kind``; ``model.name``, ``model.A`` or ``model.file``) replaces the whole table.
     """
 
-    name: Annotated[str, Field(pattern=NAME_PATTERN)]
+    name: FolderName
     """Names the loop; with count = N > 1 the loops are NAME-1 to NAME-N."""
     count: Annotated[int, Field(ge=1, le=MOST_LOOPS)] = 1
     """Number of loops; each draws its plant, initial state, disturbances, noise and phase."""

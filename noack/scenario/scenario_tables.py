@@ -20,7 +20,6 @@ from noack.protocol.roles import PROTOCOLS, LoopProtocol
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
 from noack.scenario.outputs import LoopOutput, OutputSection, loop_outputs
 from noack.scenario.run_sections import (
-    NAME_PATTERN,
     CertificateSection,
     ClocksSection,
     LoopSection,
@@ -37,7 +36,7 @@ from noack.scenario.sections import (
     NetworkSection,
     PlantSection,
 )
-from noack.settings.section import ScenarioSection
+from noack.settings.section import FolderName, ScenarioSection
 from noack.trigger_policies.decaying import DecayingSettings
 
 MOST_CHANGES = 256  # largest number of scheduled changes in a run
@@ -46,7 +45,7 @@ MOST_CHANGES = 256  # largest number of scheduled changes in a run
 class ScenarioTables(ScenarioSection):
     """The keys of a scenario; :class:`noack.scenario.scenario.Scenario` checks them together."""
 
-    name: Annotated[str, Field(pattern=NAME_PATTERN)]
+    name: FolderName
     """Names the run's directory: letters, digits, _ and -."""
     description: str = ""
     """The purpose of the scenario."""

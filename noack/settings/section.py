@@ -58,6 +58,9 @@ def require_name(text: str) -> str:
 
 
 Name = Annotated[str, Field(min_length=1, max_length=_LONGEST_NAME), AfterValidator(require_name)]
+"""How outputs, states and inputs are called in texts and figures."""
+FolderName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+"""The name of a scenario, a loop, a campaign or a link: folders, files and channels are called so."""
 Unit = Annotated[str, Field(max_length=24), AfterValidator(require_name)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]

@@ -17,7 +17,7 @@ from cosim.simulation.exact_simulation import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.core.errors import CallerError
 from noack.scenario import toml_file
-from noack.settings.section import MatrixRows, ScenarioSection, Seed
+from noack.settings.section import FolderName, MatrixRows, ScenarioSection, Seed
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12
@@ -252,7 +252,7 @@ _CHUNK_DRAWS, _SAMPLED_DRAWS = 2000, 20
 class Campaign(ScenarioSection):
     """Many runs over a grid of settings."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+    name: FolderName
     """Name of the campaign's folder: letters, digits, _ and -."""
     description: str = ""
     """The question that the campaign answers."""

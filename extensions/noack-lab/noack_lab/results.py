@@ -59,27 +59,30 @@ class ShownRun:
     @property
     def states(self) -> list[str]:
         """The names of the states."""
-        return list(dict.fromkeys(curve.panel for curve in self.curves if curve.name == "x plant"))
+        plants = (curve.panel for curve in self.curves if curve.name == "x plant")
+        return [*dict.fromkeys(panel for panel in plants if not panel.startswith(_OUTPUT))]
 
     @property
     def transmissions(self) -> NDArray[np.bool_]:
         """Whether each transmission was delivered, (k,) in the order of their times."""
-        parts = [curve for curve in self.curves if curve.name in ("delivered", "lost")]
+        names = (INTERVALS, "delivered"), (INTERVALS, "lost")
+        parts = [curve for curve in self.curves if (curve.panel, curve.name) in names]
         t_s = np.concatenate([np.zeros(0), *(curve.t_s for curve in parts)])
         arrived = [np.full(len(curve.t_s), curve.name == "delivered") for curve in parts]
         return np.concatenate([np.zeros(0, np.bool_), *arrived])[np.argsort(t_s, kind="stable")]
 
-    def values(self, name: str) -> NDArray[np.float64]:
+    def values(self, panel: str, name: str) -> NDArray[np.float64]:
         """Return the values of a curve that are known, in the order of their times."""
-        values = next((curve.values for curve in self.curves if curve.name == name), np.zeros(0))
+        curves = (curve for curve in self.curves if (curve.panel, curve.name) == (panel, name))
+        values = next((curve.values for curve in curves), np.zeros(0))
         return values[np.isfinite(values)]
 
     @property
     def facts(self) -> list[Fact]:
         """The key numbers."""
-        arrived, e_c = self.transmissions, self.values("‖e_c‖ controller")
+        arrived, e_c = self.transmissions, self.values(ERRORS, "‖e_c‖ controller")
         name = next((curve.name for curve in self.curves if curve.panel == NORM), "")
-        norm, norm_name = self.values(name), name.removesuffix(" plant")
+        norm, norm_name = self.values(NORM, name), name.removesuffix(" plant")
         lost = int(np.sum(~arrived))
         share = f" ({100 * lost / len(arrived):.0f} %)" if len(arrived) else ""
         bursts = np.diff(np.flatnonzero(np.concatenate([[True], arrived, [True]]))) - 1

@@ -52,7 +52,7 @@ def test_a_loop_that_is_unstable_says_why_and_is_drawn() -> None:
     A, B = explorer.scenario.plant.uncertainty_A, explorer.scenario.plant.uncertainty_B
     explorer.set({"plant.uncertainty_A": 15 * np.array(A), "plant.uncertainty_B": 15 * np.array(B)})
     assert "the loop does not decay without losses" in repr(explorer)
-    norm = explorer.run.values("‖x‖ plant")
+    norm = explorer.run.values("norm of the state", "‖x‖ plant")
     assert norm[-1] > norm[0]
     assert len(explorer.figure("V").axes) == 6
 

@@ -34,10 +34,10 @@ def test_what_a_live_run_prints_sets_its_state_and_its_lines() -> None:
     take(run, "progress", **PROGRESS | {"t_s": 2.0, "x_norm": None})
     assert (run.state, run.share) == ("running", 0.5)
     shown = run.shown
-    assert shown.values("‖x‖ plant").tolist() == [0.5]
+    assert shown.values("norm of the state", "‖x‖ plant").tolist() == [0.5]
     assert {float(curve.t_s[0]) for curve in shown.curves} == {0.0}
     run.norm_at_start = 3.0
-    assert run.shown.values("‖x‖ plant").tolist() == [3.0, 0.5]
+    assert run.shown.values("norm of the state", "‖x‖ plant").tolist() == [3.0, 0.5]
     assert shown.verdict[0].text == "running: 2.0 of 4 s"
     assert shown.verdict[1].text == "longest loss burst 2, largest lateness 0.25 ms"
     take(run, "end", directory="runs/a", status=0)

@@ -119,7 +119,9 @@ def _register(
     names = {}
     if not run.is_network:
         states, inputs = run.names
-        names = {"states": ", ".join(states), "inputs": ", ".join(inputs)}
+        # A name may have a comma.
+        names = {"states": json.dumps([*states], ensure_ascii=False)}
+        names["inputs"] = json.dumps([*inputs], ensure_ascii=False)
     topic = f"/{run.name}{topic}" if run.name else topic
     channels[topic] = writer.register_channel(topic, "json", schema_id, names)
     return topic

@@ -18,6 +18,7 @@ import noack
 from cosim.output.export.export_formats import export_run
 from cosim.output.viewer.rerun_program import start_rerun
 from noack.scenario.resolution import ResolvedRun
+from tests.helpers.named_scenario import named_content
 
 SCENARIO: dict[str, Any] = {
     "horizon_s": 1.0, "changes": [{"at_s": 0.5, "set": {"trigger.beta": 0.05}}],
@@ -112,3 +113,20 @@ def test_channels_of_several_loops_have_the_loops_names(tmp_path: Path) -> None:
     assert phase_ns > 0
     assert times == steps
     assert len(by_topic["/netem/packet"]) == loops.table("netem_packet").num_rows
+
+
+@pytest.mark.parametrize("names", [
+    ["lateral offset [m]", "<b>", "{}", "x" * 64, "[/]"], ["a, b", "a/b", "\\", "שלום", "e\u0301"],
+])  # fmt: skip
+def test_unusual_names_are_in_the_file(names: list[str], tmp_path: Path) -> None:
+    run = noack.simulate(noack.load(named_content(names[:2], names[2:3], names[3:])))
+    written = run.export(tmp_path / "run.mcap")
+    assert messages(tmp_path / "run.mcap")["/plant/step"]
+    for path in written:
+        assert_log_times_ascend(path)
+    with (tmp_path / "run.mcap").open("rb") as file:
+        channels = [channel for _, channel, _ in make_reader(file).iter_messages() if channel.metadata]
+    for channel in channels:
+        assert json.loads(channel.metadata["states"]) == names[:2]
+        assert json.loads(channel.metadata["inputs"]) == names[2:3]
+    assert "/plant/step" in {channel.topic for channel in channels}

@@ -3,7 +3,6 @@
 import io
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -15,33 +14,9 @@ from cosim.output.run_document import run_document
 from cosim.output.terminal_writer import print_document
 from noack.core.errors import CallerError
 from tests.helpers.command_line import invoke
+from tests.helpers.named_scenario import NAMES, named_content
 
-CHARACTERS = st.characters(exclude_categories=["C", "Z"], exclude_characters="$")
-NAMES = st.one_of(
-    st.sampled_from([
-        "lateral offset [m]", "[/]", "[bold]x", "{}", "{0}", "{x!r}", "<b>", "&amp;", "%s", "\\", "a\\",
-        "'", '"', "_x", "a/b", "..", "-", "^_^", "x_{2}", "‖e‖", "שלום", "e\u0301", "#", ",", ";", "=1+1",
-        "|", "`a`", "*", "x" * 64,
-    ]),
-    st.text(CHARACTERS, min_size=1, max_size=64),
-)  # fmt: skip
 WRONG = ["a$_$", "$x$", "x" * 65, "x" * 200, "a\u200fb", "a\nb", "\x1b[31m", " a", "a ", "\u202eabc", ""]
-
-
-def content(states: list[str], inputs: list[str], outputs: list[str]) -> dict[str, Any]:
-    return {
-        "name": "named",
-        "horizon_s": 0.05,
-        "model": {
-            "A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]], "gain": [[-1.0, -2.0]],
-            "state_names": states, "input_names": inputs,
-        },
-        "plant": {"initial_state": [1.0, 0.0], "rate_hz": 200.0},
-        "controller": {"rate_hz": 200.0},
-        "outputs": [{"name": name, "row": [1.0, i]} for i, name in enumerate(outputs)],
-        "trigger": {"beta": 0.05, "alpha_per_s": 0.2},
-        "network": {"mansd": 1, "loss": {"model": "bernoulli", "probability": 0.3}},
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize("place", ["states", "inputs", "outputs"])
@@ -50,7 +25,7 @@ def test_a_name_that_no_figure_can_show_is_refused_where_it_is_read(place: str, 
     names = {"states": ["p", "v"], "inputs": ["u"], "outputs": ["y"]}
     names[place][0] = name
     with pytest.raises(CallerError) as error:
-        noack.load(content(**names))
+        noack.load(named_content(**names))
     assert len(str(error.value).splitlines()) == 1
 
 
@@ -73,7 +48,7 @@ def test_unusual_names_reach_every_output(tmp_path: Path, names: list[str]) -> N
 
 def assert_survives(folder: Path, names: list[str]) -> None:
     """Run a scenario with these names, and write everything that noack writes of a run."""
-    run = noack.simulate(noack.load(content(names[:2], names[2:3], names[3:])), runs=folder / "runs")
+    run = noack.simulate(noack.load(named_content(names[:2], names[2:3], names[3:])), runs=folder / "runs")
     opened = noack.open_run(run.directory)
     assert [output.name for loop in opened.summary.loops for output in loop.outputs] == names[3:]
     screen = io.StringIO()
