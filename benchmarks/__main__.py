@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import NoReturn
 
 # Set before numpy is imported, as the command line does: small matrices do not gain from threads.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
@@ -24,6 +25,7 @@ from benchmarks.machine_load import MachineLoad
 from benchmarks.report import BENCHMARKS, Benchmark, MeasurementError, Row, print_table
 from noack.core.errors import NoackError, why
 from noack.core.file_access import write_whole
+from noack.runtime.command_line import Parser
 
 GOALS = (
     "latency", "startup", "simulation", "long_run", "many_loops", "batch", "relays", "relay_delay",
@@ -41,9 +43,17 @@ def all_benchmarks() -> Mapping[str, Benchmark]:
     return dict(sorted(BENCHMARKS.items()))
 
 
+class _Parser(Parser):
+    """A parser that takes an option once, and prints usage and ends after a mistake."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and the mistake, and end with status 2."""
+        argparse.ArgumentParser.error(self, message)
+
+
 def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return 0 if all could be measured."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser = _Parser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--list", action="store_true", help="list the benchmarks, and end")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="write the goals into this page")

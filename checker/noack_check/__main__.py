@@ -42,6 +42,22 @@ _CONDITIONS = {"ideal": "ideal conditions", "schedule": "its schedule"}
 _LONGEST_NAME, _MOST_KEYS, _SHORT_DIGEST = 200, 5, 12
 
 
+class _StoreOnce(argparse.Action):
+    """The value of an option, which may be given once; argparse's own keeps the last one."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        """Store the value."""
+        if option_string is not None and getattr(namespace, self.dest) is not None:
+            raise argparse.ArgumentError(self, "is given twice; it takes one value")
+        setattr(namespace, self.dest, values)
+
+
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser("noack-check", description="Verify the witnesses of bounds of a loop.")
@@ -57,9 +73,12 @@ def main() -> None:
         help="with a loop document as the first file: the proof of its bounds; both by `noack certify NAME "
         "--document DOCUMENT --proof PROOF`",
     )
-    parser.add_argument("--scenario", type=Path, help="the scenario, by `noack check NAME --resolved`")
+    parser.add_argument(
+        "--scenario", action=_StoreOnce, type=Path, help="the scenario, by `noack check NAME --resolved`"
+    )
     parser.add_argument(
         "--equations",
+        action=_StoreOnce,
         type=Path,
         help="the plant's equations, by `noack certify NAME --witness W --equations FILE`; a statement about "
         "equations needs them",

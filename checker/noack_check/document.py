@@ -7,6 +7,9 @@ from flint import arb, arb_mat
 from noack_check.balls import number
 from noack_check.check import RejectedError
 
+_MOST_ENTRIES = 100_000
+"""Of a matrix. They are counted first: to read a number takes a microsecond."""
+
 
 def read_table(table: Mapping[str, object], key: str) -> Mapping[str, object]:
     """Return a table within a table."""
@@ -44,6 +47,8 @@ def read_rows(table: Mapping[str, object], key: str) -> arb_mat:
         raise RejectedError(f"{key}: not a matrix")
     if any(len(row) != len(rows[0]) for row in rows):
         raise RejectedError(f"{key}: rows of different lengths")
+    if len(rows) * len(rows[0]) > _MOST_ENTRIES:
+        raise RejectedError(f"{key}: more than {_MOST_ENTRIES:,} numbers")
     return arb_mat([[read_number({key: value}, key) for value in row] for row in rows])
 
 

@@ -36,6 +36,8 @@ Rows = Sequence[Sequence[float]]
 _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
 """Kinds of impairments that do not change the delay of an update."""
 _MOST_GAINS = 1000
+_MOST_NUMBERS, _MOST_TABLES = 20_000, 1000
+"""Of a matrix or a list, and tables of a kind: a loop has at most 40 states, inputs and outputs."""
 
 
 class _Plants(NamedTuple):
@@ -866,6 +868,8 @@ def _tables(table: Table, name: str) -> Sequence[Table]:
     value = table.get(name.rpartition(".")[2], [])
     if not isinstance(value, list) or not all(isinstance(entry, Mapping) for entry in value):
         raise RefusedError(f"{name}: not a list of tables")
+    if len(value) > _MOST_TABLES:
+        raise RefusedError(f"{name}: more than {_MOST_TABLES:,} tables")
     return value
 
 
@@ -905,7 +909,14 @@ def _row(table: Table, name: str) -> Sequence[float]:
     value = _value(table, name)
     if not isinstance(value, list) or not value:
         raise RefusedError(f"{name}: not a list of numbers")
+    _require_few(len(value), name)
     return [_checked(entry, name) for entry in value]
+
+
+def _require_few(numbers: int, name: str) -> None:
+    """Refuse a matrix or a list that no loop has, before its numbers are read."""
+    if numbers > _MOST_NUMBERS:
+        raise RefusedError(f"{name}: more than {_MOST_NUMBERS:,} numbers")
 
 
 def _symmetric(table: Table, name: str, size: int) -> arb_mat:
@@ -922,6 +933,7 @@ def _matrix(table: Table, name: str) -> Rows:
     value = _value(table, name)
     if not isinstance(value, list) or not value:
         raise RefusedError(f"{name}: not a matrix")
+    _require_few(sum(len(row) for row in value if isinstance(row, list)), name)
     rows = [_row({name.rpartition(".")[2]: row}, name) for row in value]
     if any(len(row) != len(rows[0]) for row in rows):
         raise RefusedError(f"{name}: rows of different lengths")

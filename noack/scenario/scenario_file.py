@@ -40,6 +40,8 @@ _OF_FILES = ("sha256", "t_s", "x", "u", "samples_s", "intervals_s", "times_ms", 
 a reference, of delays, of outages, of a recording."""
 REMOVED = "none"
 """The value of ``--set`` that removes a key; a text of these letters is written in quotes."""
+_WITH_NONE = ("network.protocol",)
+"""Keys of which none is a value."""
 MOST_RECORDED_BYTES = 2**28
 """Largest size of a run's scenario file, which includes the losses and delays read from files."""
 
@@ -349,7 +351,8 @@ def _setting_of(override: str, example: str) -> tuple[str, object]:
     if not equals or not key.strip():
         excerpt = shortened(printable(override))
         raise CallerError(f"--set {excerpt}: write it as key=value, e.g. {example}")
-    return key.strip(), None if text.strip() == REMOVED else value_of(text, f"--set {key}")
+    is_removed = text.strip() == REMOVED and full_key(key.strip()) not in _WITH_NONE
+    return key.strip(), None if is_removed else value_of(text, f"--set {key}")
 
 
 def value_of(text: str, source: str) -> object:

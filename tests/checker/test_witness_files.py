@@ -12,6 +12,7 @@ from cosim.cli.application import app
 from noack.core.errors import ExitStatus
 from noack_check.__main__ import check_file, main
 from noack_check.check import RejectedError
+from noack_check.keys import RefusedError
 from noack_check.scenario import read_loop
 from noack_check.sentences import assumptions, meaning
 from tests.checker.proofs import use_stored
@@ -239,3 +240,35 @@ def test_hostile_entries_are_rejected(
 def test_a_file_without_statements_proves_nothing() -> None:
     with pytest.raises(RejectedError, match="no statements"):
         list(check_file({"scenario": {}, "statements": []}, None))
+
+
+@pytest.mark.parametrize("option", ["--scenario", "--equations"])
+def test_an_option_is_given_once(
+    option: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    status, text = run(capsys, monkeypatch, "w.json", option, "a", f"{option}=b")
+    assert (status, f"argument {option}: is given twice; it takes one value" in text) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        (("scenario", "model", "A"), "model.A: more than 20,000 numbers"),
+        (("scenario", "plant", "initial_state"), "plant.initial_state: more than 20,000 numbers"),
+        (("scenario", "outputs"), "outputs: more than 1,000 tables"),
+        (("statements", 2, "chain", "tail"), "tail: more than 100,000 numbers"),
+    ],
+)
+def test_a_size_beyond_the_limits_is_refused_before_numbers_are_read(
+    place: tuple[str | int, ...], reason: str, file: Path
+) -> None:
+    content = json.loads(file.read_text())
+    row: list[object] = ["not a number"] * 2000
+    values = {"A": [row] * 2000, "tail": [row] * 2000, "initial_state": row * 11, "outputs": [{}] * 1001}
+    table = content
+    for key in place[:-1]:
+        table = table[key]
+    assert place[-1] in table
+    table[place[-1]] = values[str(place[-1])]
+    with pytest.raises((RejectedError, RefusedError), match=re.escape(reason)):
+        list(check_file(content, None))

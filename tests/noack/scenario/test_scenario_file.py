@@ -246,6 +246,14 @@ def test_none_takes_a_key_out_that_may_be_absent(key: str) -> None:
     assert getattr(getattr(load(path, [f"{key}=none"]), section), field) == default
 
 
+def test_none_is_the_protocol_without_acknowledgements() -> None:
+    """As a line about their table advises."""
+    path = next(path for path in SHIPPED if path.stem == "lane_acknowledged")
+    for words in ("network.protocol=none", 'network.protocol="none"'):
+        assert load(path, [words]).network.protocol == "none"
+    assert load(path, [words]).network.acknowledgements is not None
+
+
 def test_none_takes_an_entry_out_and_a_text_in_quotes_stays() -> None:
     path = next(path for path in SHIPPED if path.stem == "servo_reference")
     entries = 'network.impairments=[{kind="delay", delay_s=0.001}, {kind="loss", model="lossless"}]'
