@@ -54,8 +54,8 @@ def with_later_updates(scenario: Scenario) -> tuple[Scenario, str]:
 def late_inputs(scenario: Scenario) -> str:
     """Return in a sentence that inputs may miss a step of the plant.
 
-    The sentence is empty if none is computed shortly before a step. What is computed at a step acts at
-    the next one, in every run.
+    The sentence is empty if the network carries inputs, or none is computed shortly before a step. What
+    is computed at a step acts at the next one, in every run.
     """
     if scenario.network.actuation is not None:
         return ""

@@ -54,13 +54,21 @@ def test_an_arrival_that_may_be_in_the_next_period_is_refused() -> None:
         margin(*NEAR_THE_NEXT)
 
 
-def test_either_outcome_is_that_of_a_loop_without_the_tie() -> None:
-    """A loop whose delay is 5 µs more or less has the same outcomes, the other way round."""
-    tied, later = margin().loop, margin(LATER).loop
+WITHIN_A_PERIOD = 'network.impairments=[{kind="delay", delay_s=0.005}]', "controller.update_timeout_s=0.015"
+"""At the tick of an arrival that misses it, the update before is as old as the timeout."""
+LATER_WITHIN = 'network.impairments=[{kind="delay", delay_s=0.00508}]', WITHIN_A_PERIOD[1]
+
+
+@pytest.mark.parametrize(("at", "beyond"), [((), (LATER,)), (WITHIN_A_PERIOD, LATER_WITHIN)])
+def test_either_outcome_is_that_of_a_loop_without_the_tie(
+    at: tuple[str, ...], beyond: tuple[str, ...]
+) -> None:
+    """A loop whose delay is 0.08 ms more has the same outcomes, the other way round."""
+    tied, later = margin(*at).loop, margin(*beyond).loop
     for units in (1, 3):
         for mine, other in zip(tied.times.arrivals(0), reversed(later.times.arrivals(0)), strict=True):
-            ours = floats(tied.matrix(Burst(0, 0, 0, tied.times.latest, units - 1, units, mine)))
-            theirs = floats(later.matrix(Burst(0, 0, 0, later.times.latest, units - 1, units, other)))
+            ours = floats(tied.matrix(Burst(0, 0, 0, tied.times.usable(1), units - 1, units, mine)))
+            theirs = floats(later.matrix(Burst(0, 0, 0, later.times.usable(1), units - 1, units, other)))
             np.testing.assert_allclose(ours, theirs, atol=1e-12)
 
 

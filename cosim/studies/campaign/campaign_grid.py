@@ -21,6 +21,7 @@ from cosim.studies.campaign.random_draws import Box, box_of
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario import toml_file
+from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.resolution import ResolvedRun, policy_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put
@@ -48,6 +49,8 @@ class Point:
     """Computes the draws of the point."""
     error_scale: tuple[tuple[float, object], ...] = ()
     """What ``sup_e_c_scaled`` is in units of: rate and norm of each loop's threshold."""
+    tie: str = ""
+    """At which of two ticks updates act, as a sentence; empty: none arrives at a tick."""
 
 
 @dataclass(frozen=True)
@@ -101,12 +104,15 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
         for key, value in settings:
             put(content, key, value, source)
         scenario = completed(content, scenario_path, source)
+        tie = ""
         try:
+            if campaign.time == "sampled":
+                scenario, tie = with_later_updates(scenario)
             work, certified = _work(campaign, scenario)
         except (CallerError, ValueError) as error:
             raise CallerError(f"{source}: {error}") from None
         scale = _error_scale(scenario)
-        points.append(Point(number, indices, labels, values, scenario, certified, work, scale))
+        points.append(Point(number, indices, labels, values, scenario, certified, work, scale, tie))
     if len({type(point.work) for point in points}) > 1:
         raise CallerError(f"{path}: axes: either all grid points have loops, or none has")
     _require_effects(campaign, points, path)

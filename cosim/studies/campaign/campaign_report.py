@@ -141,6 +141,9 @@ def campaign_document(
         )
     if campaign.time == "continuous":
         blocks.append(Sentence(text=_CONTINUOUS, role=SentenceRole.NOTE))
+    if ties := [result.point.tie for result in summary.results if result.point.tie]:
+        text = f"at {len(ties)} of {len(summary.results)} grid points, {ties[0]}"
+        blocks.append(Sentence(text=text, role=SentenceRole.NOTE))
     blocks += [
         Sentence(text=_INTERVALS, on_terminal=False),
         *(

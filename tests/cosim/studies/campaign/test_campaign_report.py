@@ -10,7 +10,7 @@ from cosim.output.result_tables import ResultTable
 from cosim.output.terminal_writer import without_constants
 from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_file import load
-from cosim.studies.campaign.campaign_grid import base_of
+from cosim.studies.campaign.campaign_grid import base_of, grid
 from cosim.studies.campaign.campaign_report import write_report
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.chunk_store import Store
@@ -82,3 +82,16 @@ def test_columns_that_are_the_same_at_all_points_are_named_once() -> None:
     only_labels = full._replace(rows=[("MB", "0.1", "3", "–"), ("MB", "0.5", "3", "–")])
     for unchanged in (full._replace(rows=rows[:1]), only_labels, full._replace(rows=[])):
         assert without_constants(unchanged, 2) == (unchanged, 2)
+
+
+def test_a_sampled_campaign_takes_the_later_tick_and_says_so(
+    write: Write, plan: dict[str, Any], run_command: Command
+) -> None:
+    settings = {"controller.phase": 0.0}
+    path = write(plan, time="sampled", settings=settings, figures=[], draws=2)
+    result = run_command(path)
+    text = " ".join(result.stdout.split())
+    assert result.exit_code == 0
+    assert "at 4 of 4 grid points, an update may arrive at a tick of the controller" in text
+    points = grid(load(path), path)
+    assert all(point.scenario.network.impairments for point in points)
