@@ -24,6 +24,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus, other_sign, paper_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import EQUATIONS, outside_box
+from noack.theory.coverage import is_papers_loop
 from noack.theory.witnesses.loss_margin import Stability
 
 _MOST_BOUNDS = 6
@@ -166,7 +167,7 @@ def _advice(results: Certificates) -> Sentence:
     parts = [f"so no bound of ‖x‖{', though the loop is stable' if _is_stable(results) else ''}"]
     if hint := other_sign(loop_of(results.scenario)):
         parts.append(hint)
-    if not results.is_searched:
+    if not results.is_searched and is_papers_loop(results.scenario):  # a search covers no other loop
         parts.append("a search, noack certify without --no-search, may find one if none has failed yet")
     if settings := _listed("there is one", results.helpful_settings):
         parts.append(settings)

@@ -63,6 +63,7 @@ def test_a_timeout_of_updates_has_these_answers(tmp_path: Path, monkeypatch: pyt
         result = invoke(command, case)
         assert result.exit_code != 0
         assert line in words_of(result.output)
+    assert "a search" not in words_of(invoke("certify", case, "--no-search").output)
 
 
 def test_a_controller_class_is_simulated_and_not_proven(
