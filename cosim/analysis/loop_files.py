@@ -20,7 +20,7 @@ def loop_files(resolved: Scenario, statement: WitnessedStatement) -> ProofFiles:
     if statement.document is None or statement.loop is None:
         raise CallerError(f"there is no proof: {statement.reason}")
     try:
-        return proof_files(statement.loop, statement.document, _naming(resolved, statement))
+        return proof_files(statement.loop, statement.document, naming_of(resolved, statement))
     except NoDocumentError as error:
         raise CallerError(f"there is no loop document: {error}") from None
 
@@ -36,7 +36,8 @@ def files_of_widest(resolved: Scenario, witnesses: Witnesses) -> ProofFiles:
     return loop_files(resolved, (proven or statements)[-1])
 
 
-def _naming(resolved: Scenario, statement: WitnessedStatement) -> Naming:
+def naming_of(resolved: Scenario, statement: WitnessedStatement) -> Naming:
+    """Return how the document of a statement names its loop."""
     loop = loop_of(resolved)
     units = dict(zip(loop.state_names, resolved.model.state_units or (), strict=False))
     units |= {output.name: output.unit for output in loop.outputs}

@@ -31,10 +31,20 @@ def proof_files(loop: Loop, statement: Mapping[str, object], naming: Naming) -> 
     Raises:
         NoDocumentError: it has no bounds by quadratic forms, or no document describes the loop.
     """
+    document = document_of(loop, statement, naming)
+    proof = write_proof(document, _bounds(statement))
+    return ProofFiles(document.table, as_text(document.table), as_text(proof))
+
+
+def document_of(loop: Loop, statement: Mapping[str, object], naming: Naming) -> LoopDocument:
+    """Return the loop document of a statement; raise NoDocumentError as :func:`proof_files`."""
+    rate = read_number(statement, "rate")
+    outputs = [str(bound["output"]) for bound in _bounds(statement)]
+    return LoopDocument(loop, rate, read_assumptions(loop, rate, statement), outputs, naming)
+
+
+def _bounds(statement: Mapping[str, object]) -> list[Any]:
     bounds = statement.get("bounds")
     if not isinstance(bounds, list) or not bounds:
         raise NoDocumentError("the bounds are by gains; only bounds by quadratic forms have one")
-    rate = read_number(statement, "rate")
-    outputs = [str(bound["output"]) for bound in bounds]
-    document = LoopDocument(loop, rate, read_assumptions(loop, rate, statement), outputs, naming)
-    return ProofFiles(document.table, as_text(document.table), as_text(write_proof(document, bounds)))
+    return bounds

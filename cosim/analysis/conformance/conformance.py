@@ -62,12 +62,14 @@ class Conformance(NamedTuple):
         """Whether the whole run is a run of the document."""
         return not self.reason
 
-    def __str__(self) -> str:
+    @property
+    def verdict(self) -> str:
+        """The result in one sentence."""
         taken = sum(count > 0 for count in self.edges.values())
-        coverage = f"{taken} of {len(self.edges)} kinds of transitions occurred"
+        coverage = f"{taken} of the document's {len(self.edges)} kinds of transitions occurred"
         if self.conforms:
-            return f"the run is a run of its loop document ({coverage})"
-        return f"the run is a run of its loop document until {self.until_s:.6g} s: {self.reason} ({coverage})"
+            return f"the run is a run of its loop document; {coverage}"
+        return f"the run is a run of its loop document until {self.until_s:.6g} s: {self.reason}; {coverage}"
 
 
 def compare(trace: Trace, document: Table) -> Conformance:

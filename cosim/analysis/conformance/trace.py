@@ -1,6 +1,5 @@
 """What a recorded loop did, in the words of its loop document: where it was, which edges it took, and z."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -10,16 +9,13 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.input_origins import plant_inputs
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector, exponential
 from noack.proof.loop_document import LoopDocument
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.theory.witnesses.coordinates import floats
 
 Numbers = NDArray[np.int64]
-
-
-class NoTraceError(ValueError):
-    """The record of a loop has no trace; the message says why."""
 
 
 class Item(NamedTuple):
@@ -63,13 +59,13 @@ def trace_of(record: RunRecord, document: LoopDocument) -> Trace:
     """Return the trace of a recorded loop.
 
     Raises:
-        NoTraceError: the document has parts that the record does not show, or the record is too short.
+        CallerError: the document has parts that the record does not show, or the record is too short.
     """
     loop = document.loop
     if loop.observer is not None or loop.loads or loop.offset != 0 or loop.until is not None:
-        raise NoTraceError("a loop with an observer, a load or a reference is not compared yet")
+        raise CallerError("a loop with an observer, a load or a reference is not compared yet")
     if document.model.is_by_tests or not (loop.times.sampling > 0 or document.model.is_periodic):
-        raise NoTraceError("a document with tests at exact times, or at all times, is not compared yet")
+        raise CallerError("a document with tests at exact times, or at all times, is not compared yet")
     return _Tracer(record, document).trace()
 
 
@@ -82,13 +78,19 @@ class _Tracer:
         inside = place < len(self._t_ns)
         tests, place = tests[inside], place[inside]
         if len(self._t_ns) < 2 or not (self._t_ns[place] == tests["t_ns"]).all():
-            raise NoTraceError("a measurement is not one of a step of the plant")
+            raise CallerError("a measurement is not one of a step of the plant")
         self._tests = {int(k): row for k, row in zip(place, range(len(tests)), strict=True)}
         events = tests["event"] != NO_SEQUENCE
         self._sent_step, self._sent_x = place[events], tests["x"][events]
         self._x_s, self._measured, self._is_event = tests["x_s"], tests["x"], events
-        numbers = {int(sequence): i for i, sequence in enumerate(tests["event"][events])}
-        self._acts = self._acting_steps(record, numbers)
+        knows_start = record.scenario.network.initial_sync == "known_state"
+        if knows_start:  # as if x(0) had been sent, and had arrived
+            self._sent_step = np.append(0, self._sent_step)
+            self._sent_x = np.vstack([self._x[:1], self._sent_x])
+        if not len(self._sent_step) or self._sent_step[0] != 0 or (knows_start and self._sent_step[1:2] == 0):
+            raise CallerError("a run that does not begin with an event is not compared yet")
+        numbers = {int(sequence): i for i, sequence in enumerate(tests["event"][events], int(knows_start))}
+        self._acts = self._acting_steps(record, numbers, knows_start=knows_start)
         self._H = floats(document.loop.H)
         self._exponentials: dict[int, Vector] = {}
         self._edges = {
@@ -109,10 +111,15 @@ class _Tracer:
         if newest not in self._order and self._t_ns[-1] - self._t_ns[self._sent_step[newest]] <= delay_ns:
             self._order.append(newest)  # it may be on its way when the record ends
 
-    def _acting_steps(self, record: RunRecord, numbers: dict[int, int]) -> dict[int, int]:
+    def _acting_steps(
+        self, record: RunRecord, numbers: dict[int, int], *, knows_start: bool
+    ) -> dict[int, int]:
         """Return by step the event whose update acts from it on, of several the newest one."""
         found: dict[int, int] = {}
-        for update in plant_inputs(record).updates:
+        inputs = plant_inputs(record)
+        if knows_start and np.isfinite(inputs.start_s):
+            found[int(np.searchsorted(self._t_ns, round(inputs.start_s * NS_PER_S)))] = 0
+        for update in inputs.updates:
             if update.applied_ns is not None and update.sequence in numbers:
                 step = int(np.searchsorted(self._t_ns, update.applied_ns))
                 found[step] = max(found.get(step, -1), numbers[update.sequence])
@@ -263,8 +270,3 @@ def _kind(name: str) -> str:
     if last in ("event", "sent", "lost", "delivered"):
         return "event"
     return "silent" if last == "silent" else "arrival"
-
-
-def edges_of(trace: Trace) -> Iterator[str]:
-    """Yield the edges that were taken."""
-    return (item.name for item in trace.items if not item.is_motion)

@@ -1,6 +1,7 @@
 """Commands about earlier runs: results, figures and pages, replay, export, comparison."""
 
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +23,13 @@ from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.runtime.command_line import print_to_stderr
 
 app = typer.Typer()
+
+
+class Plants(StrEnum):
+    """What a loop document is of."""
+
+    OWN = "own"
+    BOX = "box"
 
 
 @app.command(
@@ -153,6 +161,40 @@ def replay(
         result = replay_run(load_run(path), loop)
     show(replay_document(result, changed_since(path)), json=json)
     return ExitStatus.OK if result.bit_exact else ExitStatus.FAILED
+
+
+@app.command(
+    rich_help_panel=RUNS,
+    epilog=examples(
+        ("noack conform", "the last run; exit status 1 if it is another loop's"),
+        ("noack conform runs/latest --plants box", "with the document of all plants of its uncertainty"),
+    ),
+)
+def conform(
+    run_dir: opt.RunArgument = None,
+    runs: opt.RunsOption = DEFAULT_RUNS,
+    loop: opt.LoopOption = None,
+    plants: Annotated[
+        Plants,
+        Option(help="The document: of the plant itself, or of all plants of its uncertainty (box)."),
+    ] = Plants.OWN,
+    json: opt.JsonOption = False,
+) -> int:
+    """Compare a run with the loop document that its bounds are proven of.
+
+    A bound of the document holds of a run that is one of the document's runs. `noack check NAME --document`
+    prints the document. Exit status 1: the run does something that the document does not allow.
+    """
+    from cosim.analysis.conformance.run_conformance import conformance_of
+    from cosim.output.conformance_report import conformance_document
+    from cosim.record.run_record import load_run
+
+    path = chosen_run(run_dir, runs)
+    with status("comparing"):
+        record = load_run(path).loop(loop)
+        found = conformance_of(record, plants)
+    show(conformance_document(found, record.scenario.name), json=json)
+    return ExitStatus.OK if found.conforms else ExitStatus.FAILED
 
 
 @app.command(

@@ -53,7 +53,8 @@ _FIRST_SHARE, _FIRST_SLOW_SHARE, _SMALLEST_SHARE = 0.42, 0.04, 0.02
 _SMALL_SHARE = 0.05
 """Where the first shares have no solution; so in loops whose plant is known roughly."""
 _MOST_TRIES, _FEW_TRIES, _LARGE = 5, 2, 1.0
-"""Shares that are tried for an output, also for a problem that is large: its work is above a limit."""
+"""Shares that are tried for an output, also for a problem that is large: its work is above a limit. Forms of
+updates on their way then have no products with other states, so that the problem becomes smaller."""
 _ROOM, _NEAR = 1 + 1e-6, 1.04
 _PIECES, _PIECES_OF_TESTS = (4, 16), (1, 4, 32)
 """Of the period of a periodic rule, or of the time between two tests, until there is a witness."""
@@ -61,8 +62,6 @@ _COUNTED = 32, 128
 """Silent tests that are counted since an event, until there is a witness."""
 _MOST_LOSSES = 24
 _MOST_GUESSES = 6
-_LARGE = 1.0
-"""Problems of more 10⁹ products per step are made smaller, though some bounds become larger."""
 _EXPECTED = 5
 """Problems that are solved for an output, about."""
 
@@ -562,7 +561,7 @@ class _OutputSearch:
             del self._known[output, starts]
             return self._tried(output, starts=starts)
         most = _MOST_TRIES
-        if is_direct:
+        if is_direct or self._templates.work(output) > _LARGE:
             most = 1 if self._share else _FEW_TRIES
         first, upwards = self._share or self._rates.first_share, not self._share
         search_lowest(size, first, most, upwards=upwards, moves=self._rates.moves)
@@ -576,7 +575,8 @@ class _OutputSearch:
         With friction the first coordinates are too far off: a margin there costs much of the bound.
         """
         is_known = (output, starts) in self._known and not self._is_rough and not self._loop.along
-        return is_known or self._templates.work(output) > _LARGE
+        work = self._templates.work(output)
+        return is_known or (work > _LARGE and not self._effort.has_room(work))
 
     def _solve(
         self, search: Search, output: str, decay: float, *, starts: bool, margin: float, accuracy: Accuracy

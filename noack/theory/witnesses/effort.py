@@ -10,6 +10,7 @@ PROBLEMS = 10
 """A search has work for at least so many problems. A larger problem takes minutes: those of the F-16 under
 its schedule need 9 to 17. In eleven shipped scenarios the largest one is 0.5."""
 _LAST_SHARE = 0.99
+_MANY = 12
 
 
 class NoWitnessError(ArithmeticError):
@@ -44,6 +45,10 @@ class Effort:
         self._progress, self._most_work = progress, most_work
         self.most_per_problem = most_work / PROBLEMS
         self._problems, self._expected, self._work, self._share = 0, 0, 0.0, 0.0
+
+    def has_room(self, work: float) -> bool:
+        """Return whether a search has work for many problems of a size."""
+        return self._most_work > _MANY * work
 
     def expect(self, problems: int) -> None:
         """Add problems to those that are expected."""

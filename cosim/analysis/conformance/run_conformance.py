@@ -1,0 +1,41 @@
+"""The conformance of a recorded loop with the loop document of its scenario's bounds."""
+
+from cosim.analysis.claims.common_end import up_to_common_end
+from cosim.analysis.conformance.conformance import Conformance, compare
+from cosim.analysis.conformance.trace import trace_of
+from cosim.analysis.loop_files import naming_of
+from cosim.analysis.witnesses import WitnessedStatement, find_statement, plants_of
+from cosim.record.run_record import RunRecord
+from noack.core.errors import CallerError
+from noack.proof.files import document_of
+from noack.proof.loop_document import NoDocumentError
+
+
+def conformance_of(record: RunRecord, plants: str | None = None) -> Conformance:
+    """Return whether a recorded loop is a run of the document of its bounds, which are known already.
+
+    Args:
+        record: of the loop; of a stopped run, it is compared up to its common end.
+        plants: "own", "box" or "region"; by default the plant itself.
+
+    Raises:
+        CallerError: no document describes the loop, or it cannot be compared yet; the message says why.
+    """
+    scenario = record.scenario
+    statement = find_statement(scenario, plants or plants_of(scenario)[0], "schedule", most_work=0.0)
+    return conformance_with(record, statement)
+
+
+def conformance_with(record: RunRecord, statement: WitnessedStatement) -> Conformance:
+    """Return whether a recorded loop is a run of the document of a statement.
+
+    Raises:
+        CallerError: as :func:`conformance_of`.
+    """
+    if statement.document is None or statement.loop is None:
+        raise CallerError(f"there is no proof that the run could be compared with: {statement.reason}")
+    try:
+        document = document_of(statement.loop, statement.document, naming_of(record.scenario, statement))
+        return compare(trace_of(up_to_common_end(record), document), document.table)
+    except NoDocumentError as error:
+        raise CallerError(f"there is no loop document: {error}") from None

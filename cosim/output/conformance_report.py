@@ -1,0 +1,36 @@
+"""Whether a run is a run of its loop document: the verdict, and what the run shows of the document."""
+
+from cosim.analysis.conformance.conformance import Conformance
+from cosim.output.document import Document, Sentence, SentenceRole
+from cosim.output.result_tables import ResultTable, Tone
+
+
+def conformance_document(found: Conformance, name: str) -> Document:
+    """Return the verdict about a loop of some name, and tables of what its run shows of the document."""
+    tone = Tone.GOOD if found.conforms else Tone.BAD
+    shares = [(place, f"{100 * share:.0f} %") for place, share in found.clocks.items()]
+    return Document(
+        title=f"conformance of {name}",
+        data={
+            "conforms": found.conforms,
+            "until_s": found.until_s,
+            "reason": found.reason,
+            "transitions": dict(found.edges),
+            "clock_shares": dict(found.clocks),
+        },
+        blocks=[
+            Sentence(text=found.verdict, role=SentenceRole.VERDICT, tone=tone, is_prose=True),
+            ResultTable(
+                "",
+                "transitions of the document, and how often each occurred",
+                ("transition", "occurred"),
+                [(edge, f"{count:,}") for edge, count in found.edges.items()],
+            ),
+            ResultTable(
+                "",
+                "largest share of each location's time limit that the run reached",
+                ("location", "share"),
+                shares,
+            ),
+        ],
+    )
