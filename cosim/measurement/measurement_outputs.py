@@ -16,7 +16,7 @@ from cosim.measurement.network_section import Form, write_network
 from cosim.output.curves import DASHED
 from cosim.output.document import Document, Sentence, SentenceRole
 from cosim.output.figures import palette
-from cosim.output.figures.axes_parts import draw_bars, draw_line, rgb, set_times, whole_numbers
+from cosim.output.figures.axes_parts import draw_bars, draw_line, limit_to, rgb, set_times, whole_numbers
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.figures.palette import Colour
@@ -329,6 +329,9 @@ def _draw_delays(axes: "Axes", measurement: NetworkMeasurement) -> None:
     unknown = lost | (trace.delays_unknown != "")
     values = np.asarray(np.where(unknown, np.nan, np.maximum(trace.delay_ns, 1)) * 1e-9)
     axes.set(title="Delay over time", ylabel="delay [s]", yscale="linear" if unknown.all() else "log")
+    deadline_s = measurement.options.deadline_s
+    if not unknown.all():
+        limit_to(axes, np.append(values, values if deadline_s is None else deadline_s))
     draw_line(axes, sent_s, values, _DELAYS, linewidth=0.8, marker=".", markersize=2.5)
     begin_s, duration_s = measurement.bursts.subset(measurement.is_outage).times_s(trace)
     for begin, end in zip(begin_s, begin_s + duration_s, strict=True):
@@ -337,8 +340,8 @@ def _draw_delays(axes: "Axes", measurement: NetworkMeasurement) -> None:
         sent_s[lost], np.full(int(lost.sum()), _MARK_HEIGHT), "x", color=rgb(_LOST), markersize=3.5,
         clip_on=False, transform=axes.get_xaxis_transform(),
     )  # fmt: skip
-    if measurement.options.deadline_s is not None:
-        axes.axhline(measurement.options.deadline_s, color=rgb(_LIMIT), dashes=DASHED, linewidth=1.6)
+    if deadline_s is not None:
+        axes.axhline(deadline_s, color=rgb(_LIMIT), dashes=DASHED, linewidth=1.6)
     set_times(axes, sent_s)
     axes.set_xlabel("sending time [s]")
 

@@ -168,9 +168,21 @@ def limit_decades(axes: "Axes", measured: Reals, decades: int) -> None:
     decade = 10.0 ** math.floor(math.log10(np.nanmax(measured)))
     low = max(values.min(initial=np.inf), decade / 10**decades)
     high = min(values.max(initial=0.0), decade * 10**decades)
-    margin = max((high / low) ** 0.05, 1.1)
     if high > 0:
-        axes.set_ylim(float(low / margin), float(high * margin))
+        _limit(axes, low, high)
+
+
+def limit_to(axes: "Axes", values: Reals) -> None:
+    """Let a logarithmic vertical axis show all values that it can, also if they are nearly equal."""
+    shown = finite(values, positive=True)
+    if np.isfinite(shown).any():
+        _limit(axes, np.nanmin(shown), np.nanmax(shown))
+
+
+def _limit(axes: "Axes", low: float, high: float) -> None:
+    """Let a logarithmic vertical axis show what is between two values, and a margin."""
+    margin = max((high / low) ** 0.05, 1.1)
+    axes.set_ylim(float(low / margin), float(high * margin))
 
 
 def whole_numbers(axes: "Axes", letter: str) -> None:

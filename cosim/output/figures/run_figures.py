@@ -391,15 +391,15 @@ def _outputs(record: RunRecord, bounds: Mapping[str, list[Curve]]) -> PageFigure
                         alpha=_FAR_OPACITY,
                     )
             low, high = axes.get_ylim()
-            if 0 < _FAR * highest[output] < high:
-                axes.set_ylim(top=_FAR * highest[output])
+            if highest[output] > 0:
+                high = min(high, _FAR * highest[output])
             values = curves[0].values
             if output.allowed is not None:  # what is far within is of no interest, unless all is
                 low = _LEAST_SHOWN * min(output.allowed, values.max(initial=0.0))
             elif len(values):  # nor how near the samples are to the moment at which it is 0
                 low = max(low, np.quantile(values, _RARE) / 2)
             if 0 < low < high:
-                axes.set_ylim(bottom=low)
+                axes.set_ylim(low, high)
             unit = f" [{label_text(output.unit)}]" if output.unit else ""
             axes.set_ylabel(f"distance{unit}")
             set_times(axes, curves[0].t_s, labelled=i == len(drawn) - 1)

@@ -17,6 +17,7 @@ from cosim.output.figures.axes_parts import (
     draw_marks,
     finite,
     histogram,
+    limit_to,
     rgb,
     whole_numbers,
 )
@@ -46,6 +47,7 @@ def _times_figure(
     def draw(figure: "Figure") -> list[Panels]:
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set(yscale="log", title=title, ylabel=label, xlabel=TIME, xlim=(0.0, t_s.max(initial=until_s)))
+        limit_to(axes, np.concatenate([values, *(bound.values for bound in bounds)]))
         counted = figure.add_axes((0, 0, 1, 1), sharey=axes)
         edges, counts = histogram(values)
         draw_bars(counted, edges, counts, colour, share=0.9, is_horizontal=True)

@@ -75,6 +75,13 @@ def test_a_figure_without_data_states_that() -> None:
             assert {"no data", "no loss"} & {text.get_text() for text in axes.texts}, name
 
 
+def test_equal_bounds_of_intervals_of_which_there_are_none_are_drawn() -> None:
+    """A line across a logarithmic axis is rounded: limits around it alone would coincide."""
+    equal = [("certified", "inter_event", T_S, np.full(len(T_S), 0.01), "certified")] * 2
+    figure = run_figures(CASES["empty"](), equal, timed=False)["inter-event"]()
+    assert figure.draw(3.4).axes[0].get_ylim() == pytest.approx((0.01 / 1.1, 0.011))
+
+
 def labels(axes: Axes) -> list[str]:
     legend = axes.get_legend()
     return [] if legend is None else [text.get_text() for text in legend.get_texts()]
