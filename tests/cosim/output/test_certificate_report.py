@@ -270,6 +270,27 @@ def test_a_witness_that_is_not_found_is_said(tmp_path: Path) -> None:
     assert not file.exists()
 
 
+NONE = ("own", "schedule", None)
+
+
+@pytest.mark.parametrize(
+    ("statements", "status"),
+    [
+        ([NONE], ExitStatus.FAILED),
+        ([NONE, ("box", "schedule", PROVEN)], ExitStatus.OK),
+        ([NONE, ("own", "ideal", PROVEN)], ExitStatus.OK),
+    ],
+)
+def test_each_proof_is_enough_for_the_exit_status(
+    statements: list[Any], status: ExitStatus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also one for all plants of the box alone, or for the idealised loop."""
+    monkeypatch.setattr(Certificates, "prove", lambda self, *_, **__: with_proofs(self, *statements))
+    for advice in ("helpful_settings", "largest_settings"):
+        monkeypatch.setattr(f"cosim.analysis.certificates.{advice}", lambda *_: ())
+    assert invoke("certify", "lane_following", "--no-search").exit_code == status
+
+
 def test_a_guarantee_about_a_reference_ends_with_the_run() -> None:
     results = with_proofs(Certificates(resolved("servo_reference")), ("own", "schedule", PROVEN))
     assert ", up to 16 s, although" in printed(results)

@@ -212,15 +212,32 @@ def lost_of(releases: Sequence[int | None]) -> list[bool]:
     ]
 
 
-def settle(link: LinkState, packet: int, release_ns: int | None) -> Any:
-    """Settle a packet that leaves at a time, or is dropped (None); return its decision."""
+def settle(link: LinkState, packet: int, release_ns: int | None, **copy: int) -> Any:
+    """Settle a packet that leaves at a time, or is dropped (None), and its copy; return its decision."""
     fate = core.NOACK_DROPPED if release_ns is None else core.NOACK_DELIVERED
     never = {"copy_ns": -1, "bit": -1, "copy_bit": -1}
-    decision = ffi.new("noack_decision *", {"fate": fate, "packet": packet, **never})
+    decision = ffi.new("noack_decision *", {"fate": fate, "packet": packet, **never, **copy})
     decision.release_ns = -1 if release_ns is None else release_ns
     core.noack_settle(link.core, 0, decision)
     link.flow(0).packets += 1
     return decision
+
+
+@pytest.mark.parametrize(
+    ("copy", "times"),
+    [
+        ({"copy_ns": 7}, (10, 10)),
+        ({"copy_ns": 12}, (10, 12)),
+        ({"bit": 3, "copy_ns": 7}, (4, 10)),  # what leaves corrupted makes nothing stale
+    ],
+)
+def test_a_copy_is_held_back_like_its_datagram(copy: dict[str, int], times: tuple[int, int]) -> None:
+    """The copy, too, would make the datagram stale that is to leave before."""
+    link = LinkState(settings_of("delay 1s mansd 0"), 0, "a")
+    link.start_flow(0, 0)
+    settle(link, 0, 10)
+    decision = settle(link, 1, 4, **copy)
+    assert (decision.release_ns, decision.copy_ns) == times
 
 
 @settings(max_examples=40)
