@@ -46,9 +46,8 @@ def trace_of(file: bytes, size_bytes: int, order: str = "big") -> PacketTrace:
 
 def lost_of(packets: Sequence[int]) -> list[int]:
     """Return the places, from the first packet, of those that are missing."""
-    return sorted(
-        {k - min(packets) for k in range(min(packets), max(packets))} - {k - min(packets) for k in packets}
-    )
+    first = min(packets)
+    return [k - first for k in sorted({*range(first, max(packets))} - {*packets})]
 
 
 @pytest.mark.parametrize(("size_bytes", "order"), [(1, "big"), (2, "little"), (3, "big"), (8, "little")])

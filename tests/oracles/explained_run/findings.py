@@ -1,6 +1,7 @@
 """What the model does not explain in a run, and what all checks use: exact flows and tolerances."""
 
 from bisect import bisect_right
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -50,6 +51,7 @@ class ExplainedLoop:
         self.until_ns = min([*changes, _diverges_ns(record[PLANT_STEP])])
         self.findings: list[Unexplained] = []
         self._flows: dict[int, Matrix] = {}
+        self._resting: dict[int, Vector | None] = {}
 
     def rows(self, table: str, *, time: str = "t_ns") -> Rows:
         """Return the rows of a table before the first change, in the order of inputs."""
@@ -78,13 +80,18 @@ class ExplainedLoop:
         reference = self.loop.reference
         if reference is None:
             return np.zeros(self.loop.n + self.loop.m)
-        segment = reference.segments[bisect_right(reference.since_ns, t_ns if since_ns is None else since_ns)]
-        return segment.at((t_ns - segment.begin_ns) * 1e-9)
+        place = bisect_right(reference.since_ns, t_ns if since_ns is None else since_ns)
+        segment = reference.segments[place]
+        if place not in self._resting:
+            self._resting[place] = segment.at(0.0) if segment.is_constant else None
+        resting = self._resting[place]
+        return segment.at((t_ns - segment.begin_ns) * 1e-9) if resting is None else resting
 
     def is_near(self, found: Vector, expected: Vector, *scales: Vector) -> bool:
         """Whether two vectors differ by no more than rounding errors of numbers as large as the scales."""
-        largest = max(float(np.abs(v).max(initial=0.0)) for v in (found, expected, *scales))
-        return bool(np.abs(found - expected).max(initial=0.0) <= ROUNDING * largest + 1e-300)
+        entries = chain.from_iterable(v.tolist() for v in (found, expected, *scales))  # few: numpy is slower
+        limit = ROUNDING * max(map(abs, entries), default=0.0) + 1e-300
+        return all(map(limit.__ge__, map(abs, (found - expected).tolist())))
 
 
 def _diverges_ns(steps: Rows) -> int:
