@@ -116,7 +116,7 @@ define LEVEL
 	@trap 'exit 130' INT; failed=0; run() { $(PYTEST) "$$@" || [ $$? = 5 ] || failed=1; }; \
 	run -m "($(1)) and not live" $(AT_ONCE); \
 	run $(OF_EXTENSIONS) -m "($(1)) and not live" $(AT_ONCE); \
-	run -m "($(1)) and live"; \
+	run -m "($(1)) and live" tests/integration; \
 	run $(OF_EXTENSIONS) -m "($(1)) and live"; \
 	exit $$failed
 endef

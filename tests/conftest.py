@@ -51,7 +51,15 @@ settings.register_profile(
 settings.load_profile("noack")
 
 
-def pytest_collection_modifyitems() -> None:
+LIVE_TESTS = Path(__file__).parent / "integration"
+"""The one folder that ``make test`` collects for live tests."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        is_own = Path(__file__).parent in item.path.parents  # not of an extension
+        if is_own and LIVE_TESTS not in item.path.parents and item.get_closest_marker("live"):
+            raise pytest.UsageError(f"{item.nodeid}: a live test belongs into tests/integration")
     if settings().derandomize:
         # Hypothesis would also try constants of the loaded modules, which depend on the tests that
         # this worker has run before.

@@ -1,4 +1,4 @@
-"""Live runs and processes, started in the background, as fixtures; each complete run is explained."""
+"""Live runs, processes and emulators in the background, as fixtures; each complete run is explained."""
 
 import json
 import subprocess
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from cosim.record.run_record import load_run
+from tests.helpers.emulators import Emulate, start_emulators
 from tests.helpers.live_runs import Running, start_commands, start_runs
 from tests.oracles.explained_run.explain import explains
 from tests.oracles.explained_run.findings import SCHEDULE
@@ -56,3 +57,10 @@ def by_hand(tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
     """Start one process by hand; kill remaining processes at the end."""
     with start_commands() as start:
         yield lambda role: start(role, "--json", runtime=tmp_path)
+
+
+@pytest.fixture
+def emulate(tmp_path: Path) -> Iterator[Emulate]:
+    """Start emulators; kill the remaining ones at the end."""
+    with start_emulators(tmp_path) as start:
+        yield start

@@ -16,9 +16,9 @@ from noack.core.errors import ExitStatus, MachineError
 from noack.runtime.address import address_text
 from noack.runtime.udp_sockets import enlarge_buffer
 from tests.attacks.attacked import unread_bytes
+from tests.helpers.emulators import Emulate
 from tests.helpers.two_hosts import TwoHosts, enter_namespace, two_hosts
 from tests.helpers.waiting import wait_for
-from tests.netem.conftest import Emulate
 
 pytestmark = [pytest.mark.live, pytest.mark.system]
 

@@ -22,7 +22,7 @@ from noack.runtime.command_line import Signals
 
 pytestmark = [pytest.mark.live, pytest.mark.system]
 
-ENDS = str(Path(__file__).with_name("ends.py"))
+ENDS = str(Path(__file__).with_name("shell_ends.py"))
 SHELL = [sys.executable, "-m", "netem", "shell"]
 PATIENCE_S = 120
 

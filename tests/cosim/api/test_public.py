@@ -83,13 +83,12 @@ def test_an_unknown_name_is_refused_with_a_message() -> None:
 
 WITHOUT_EXAMPLE = {"__version__", "ExportedRun", "follow"}
 """What an export is given, and what needs a run of another program."""
-EXAMPLES = sorted({*noack.__all__, *noack._NOT_IN_STAR} - WITHOUT_EXAMPLE)
+LIVE = {"run"}  # tests/integration/test_documented_runs.py
+EXAMPLES = sorted({*noack.__all__, *noack._NOT_IN_STAR} - WITHOUT_EXAMPLE - LIVE)
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.live if name == "run" else ()) for name in EXAMPLES]
-)
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_the_examples_of_the_docstrings_run(name: str) -> None:
     (example,) = doctest.DocTestFinder(recurse=False).find(getattr(noack, name), name, module=False, globs={})
     outcome = doctest.DocTestRunner().run(example)

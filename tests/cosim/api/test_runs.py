@@ -2,10 +2,6 @@
 
 import gc
 import json
-import os
-import signal
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -17,7 +13,6 @@ from matplotlib.figure import Figure
 import noack
 from cosim.record.align import align_tables
 from cosim.record.run_record import load_record
-from tests.helpers.live_runs import WITHOUT_VIEWER
 
 
 def test_a_run_gives_its_results(simulated: noack.Run) -> None:
@@ -76,27 +71,6 @@ def test_a_run_of_the_api_has_an_ordinary_run_directory(
     assert newest.directory.samefile(run.directory)
     assert newest.summary == run.summary
     assert newest.report() == newest.directory / "report.html"
-
-
-@pytest.mark.live
-def test_an_interrupted_live_run_is_returned() -> None:
-    program = (
-        "import noack\n"
-        "scenario = noack.load('double_integrator', {'horizon_s': 10.0, 'certificate.prove': False})\n"
-        "run = noack.run(scenario, progress=True)\n"
-        "print(run.ok, run.reason, run.summary.reached_s > 0)"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        # A terminal: to a pipe progress is printed after ten seconds.
-        env=os.environ | WITHOUT_VIEWER | {"FORCE_COLOR": "1", "TERM": "dumb"},
-    ) as process:  # fmt: skip
-        assert process.stderr is not None
-        assert any("/10 s" in line for line in process.stderr)
-        process.send_signal(signal.SIGINT)
-        stdout, _ = process.communicate(timeout=100)
-    assert stdout.split("\n")[0] == "False stopped by the user (SIGINT) True"
-    assert process.returncode == 0
 
 
 def test_a_table_is_the_file_with_a_column_of_seconds_first(simulated: noack.Run) -> None:

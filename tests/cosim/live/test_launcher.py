@@ -8,16 +8,13 @@ from typing import Any, cast
 
 import pytest
 
-import noack
-from cosim.live.finalize import reopen
-from cosim.live.launcher import _Run, launch
+from cosim.live.launcher import _Run
 from cosim.live.monitoring.run_observers import RunObserver, RunObservers
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
 from cosim.live.processes.early_certificates import EarlyCertificates
 from noack.core.errors import ExitStatus
 from noack.protocol.roles import RECORDER, ROLES
-from noack.runtime import command_line
-from noack.runtime.command_line import Signals, StopRequestError
+from noack.runtime.command_line import Signals
 from noack.scenario.resolution import resolve_run
 from noack.scenario.scenario_file import validate
 from tests.helpers.waiting import wait_for
@@ -221,24 +218,3 @@ def test_why_a_run_ends_early_is_shown_before_its_processes_end(case: Case) -> N
     status, reason = run.watch(Signals(), lambda *_: None)
     assert calls == [reason, {"warnings": ["late"]}]
     assert (status, reason) == (ExitStatus.FAILED, "plant died: killed by SIGKILL")
-
-
-@pytest.mark.live
-def test_after_a_second_signal_the_record_is_incomplete_and_can_be_completed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(command_line, "_ECHO_NS", -1)  # the second one may follow at once
-
-    def interrupt(_: object) -> None:
-        signal.raise_signal(signal.SIGINT)
-
-    with pytest.raises(StopRequestError, match=r"stopped by the user \(SIGINT\)") as stopped:
-        launch(
-            noack.load("double_integrator"),
-            tmp_path,
-            observers=[Calls(started=interrupt, stopping=interrupt)],
-        )
-    (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
-    how = f"the run's record is incomplete: `noack summary {run_dir}` completes it"
-    assert (stopped.value.exit_status, stopped.value.__notes__) == (ExitStatus.INTERRUPTED, [how])
-    assert reopen(run_dir, view=False).status == ExitStatus.INTERRUPTED

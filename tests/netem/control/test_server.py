@@ -27,9 +27,7 @@ from netem.tc_words import settings_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.connections.zenoh_session import open_session
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.netem.conftest import Emulate
 from tests.netem.control.fake_relay import FakeRelay
-from tests.netem.relay.relays import endpoints
 
 
 @pytest.fixture
@@ -169,41 +167,3 @@ def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
         assert run("watch lab") == ExitStatus.OK
         reading.result()
     assert [line.split("  ")[1] for line in lines] == ["up forward", "down", "up forward", "down"]
-
-
-@pytest.mark.live
-def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:
-    sent = [number.to_bytes(2) for number in range(320)]
-    with endpoints(*["127.0.0.1"] * 2) as (server, client):
-        for endpoint in (server, client):
-            endpoint.settimeout(60)
-        emulator = emulate("{}:{}".format(*server.getsockname()), "--control", "lab")
-        client.connect((emulator.host, emulator.port))
-        assert running_emulators() == ["lab"]
-        for payload in sent[:20]:
-            client.send(payload)
-        assert [server.recv(10) for _ in range(20)] == sent[:20]
-
-        assert emulator_commands.main(["set", "loss", "100%", "mansd 2"]) == ExitStatus.OK
-        assert "forward: loss 100% mansd 2\n" in capsys.readouterr().out
-        for payload in sent[20:]:
-            client.send(payload)
-        received = [int.from_bytes(server.recv(10)) for _ in range(100)]
-        assert received == list(range(22, 320, 3))
-
-        assert emulator_commands.main(["show", "--json"]) == ExitStatus.OK
-        totals = json.loads(capsys.readouterr().out)["links"][0]["forward"]
-        assert (totals["received"], totals["forwarded"]) == (320, 120)
-        assert (totals["fates"]["dropped"], totals["fates"]["forced"]) == (200, 100)
-        assert (totals["longest_loss_burst"], totals["mansd"]) == (2, 2)
-        assert totals["loss"]["realised"] == pytest.approx(2 / 3)
-        assert totals["loss"]["predicted"] == pytest.approx(2 / 3)
-        assert sum(totals["unintended"].values()) == 0
-        assert [flow["packets"] for flow in totals["flows"]] == [320]
-
-        assert emulator_commands.main(["set", "lab", "loss 5%"]) == ExitStatus.OK
-        assert capsys.readouterr().err == (
-            "noack netem set: relay forward no longer has mansd 2; the words replaced all settings\n"
-        )
-        emulator.finish()
-    assert running_emulators() == []

@@ -2,15 +2,12 @@
 
 import ast
 import os
-import signal
 import socket
 import struct
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -144,30 +141,6 @@ def test_the_relay_reuses_memory_of_datagrams_and_clients_that_left(
             assert len(relay._clients._free_rows) == len(memory.clients)
             assert relay._clients._paths == {}
             assert relay._directions[0].rows == 16
-
-
-@pytest.mark.live
-def test_datagrams_that_arrived_while_the_relay_was_stopped_come_before_housekeeping() -> None:
-    """It is stopped for 60 ms while it waits for a pause, in which to do housekeeping that is due."""
-    with (
-        endpoints(HOSTS[4], HOSTS[4]) as (server, client),
-        closing(Relay([link(name_of(server), return_path=False)])) as stopped,
-    ):
-        relay: Any = stopped
-        relay._epoch_ns = time.monotonic_ns()
-        to = relay.addresses()["test"]
-
-        def stop() -> None:
-            relay._memory.core.clock.epoch_ns -= 60_000_000
-            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
-
-        before = signal.signal(signal.SIGUSR1, lambda *_: client.sendto(b"waits", to))
-        try:
-            threading.Timer(0.003, stop).start()
-            relay._relay_until(0)
-        finally:
-            signal.signal(signal.SIGUSR1, before)
-        assert relay.report()[0].forward.counters.received == 1
 
 
 def hashed(key: NDArray[np.int64], secret: tuple[int, int] = (0, 0)) -> int:

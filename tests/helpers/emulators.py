@@ -1,14 +1,13 @@
-"""Fixtures for netem's tests: emulators in separate processes."""
+"""Emulators in separate processes."""
 
 import json
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-
-import pytest
 
 
 class Emulator:
@@ -58,18 +57,20 @@ class Emulator:
 Emulate = Callable[..., Emulator]
 
 
-@pytest.fixture
-def emulate(tmp_path: Path) -> Iterator[Emulate]:
+@contextmanager
+def start_emulators(folder: Path) -> Iterator[Emulate]:
     """Start emulators; kill the remaining ones at the end."""
     started: list[Emulator] = []
 
     def start(to: str, *words: str, listen: str = "127.0.0.1:0", inside: Sequence[str] = ()) -> Emulator:
-        folder = tmp_path / f"emulator {len(started)}"
-        folder.mkdir()
-        started.append(Emulator(folder, to, *words, listen=listen, inside=inside))
+        own = folder / f"emulator {len(started)}"
+        own.mkdir()
+        started.append(Emulator(own, to, *words, listen=listen, inside=inside))
         return started[-1]
 
-    yield start
-    for emulator in started:
-        emulator.process.kill()
-        emulator.process.communicate()
+    try:
+        yield start
+    finally:
+        for emulator in started:
+            emulator.process.kill()
+            emulator.process.communicate()
