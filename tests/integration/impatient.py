@@ -8,6 +8,10 @@ import os
 import signal
 
 from noack.runtime import end_reasons, join_run
+from noack.runtime.connections import zenoh_session
+
+LEASE_S = 2.0
+"""A connection whose other end is silent for longer breaks."""
 
 
 def stop_if_frozen(title: str) -> None:
@@ -22,12 +26,13 @@ _setproctitle = join_run.setproctitle
 
 def main() -> None:
     """Run a command; the processes that it forks have the same time-outs."""
-    end_reasons.LOST_AFTER_S, end_reasons.LAUNCHED_LOST_S = 4.0, 8.0
+    end_reasons.LOST_AFTER_S, end_reasons.LAUNCHED_LOST_S = 4.0, 5.0
+    zenoh_session._LEASE_MS = round(1e3 * LEASE_S)
     join_run.setproctitle = stop_if_frozen
     from cosim.cli import main as noack  # it copies the time-outs
     from cosim.live import launcher  # the same
 
-    launcher._STOP_TIMEOUT_S = 4.0
+    launcher._STOP_TIMEOUT_S = 2.0
     noack()
 
 

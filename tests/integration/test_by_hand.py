@@ -31,7 +31,7 @@ RECORD = ("record", "lane_following")
 def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> None:
     """The loop reaches its horizon, and each process stores all of its rows itself."""
     horizon_s = 24.0  # a machine that stalls for seconds does not reach it before the kill
-    recording = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=horizon_s), command=RECORD)
+    recording = start(*live.AT_RATE, *live.settings(speed=8.0, horizon_s=horizon_s), command=RECORD)
     processes = {role: by_hand(role) for role in LOOP_ROLES}
     recording.wait_recording()
     run_dir = (recording.runs / "latest").resolve()

@@ -20,7 +20,7 @@ def test_loops_of_different_odd_rates_are_replayed_bit_for_bit(tmp_path: Path) -
         f'{{name="{name}", plant={{rate_hz={rate_hz!r}}}, controller={{rate_hz={rate_hz / (1 + number)!r}}}}}'
         for number, (name, rate_hz) in enumerate(rates.items())
     )
-    finished = run_scenario(tmp_path, *settings(horizon_s=2.0), "--set", f"loops=[{loops}]")
+    finished = run_scenario(tmp_path, *settings(horizon_s=1.5), "--set", f"loops=[{loops}]")
     run = load_run(finished.run_dir)
     assert [*run.names] == [*rates]
     for record, rate_hz in zip(run.loops, rates.values(), strict=True):

@@ -32,7 +32,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
         for impairment in IMPAIRMENTS
     ) + "}"  # fmt: skip
     values = {
-        "horizon_s": 8.0,
+        "horizon_s": 4.0,
         "speed": 2.0,
         "trigger__beta": 0.001,  # an event at almost every measurement
         "network__mansd": MANSD,
@@ -116,7 +116,7 @@ ACTUATION = (
 
 
 def test_actuations_are_lost_within_their_guarantee(tmp_path: Path) -> None:
-    sets = ("horizon_s=4", ACTUATION, "controller.predictions=5", "trigger.beta=0.02")
+    sets = ("horizon_s=4", "speed=2", ACTUATION, "controller.predictions=5", "trigger.beta=0.02")
     options = [word for setting in sets for word in ("--set", setting)]
     finished = run_scenario(tmp_path, *AT_RATE, *options)
     assert finished.status == 0, finished.stderr

@@ -15,14 +15,15 @@ from noack.protocol.roles import LOOP_ROLES, ROLES
 from tests.cosim.output.viewer.recordings import read
 from tests.helpers import live_runs as live
 from tests.helpers.waiting import is_left
+from tests.integration.impatient import LEASE_S
 
 pytestmark = pytest.mark.live
 
-DISTURBED_S = 18.0
-PAUSE_S = 0.7
-"""Well below zenoh's lease, and far above every delay that a certificate allows."""
-SILENT_S = 3.0
-"""Above the lease: all connections break, come back, and rows are sent again."""
+DISTURBED_S = 12.0
+PAUSE_S = 0.3
+"""Well below the lease, and far above every delay that a certificate allows."""
+SILENT_S = LEASE_S + 0.5
+"""All connections break, come back, and rows are sent again."""
 
 
 class Disturbed(NamedTuple):
@@ -62,7 +63,7 @@ def disturbed_run(folder: Path) -> Disturbed:
         for name in [name for name in os.environ if "DISPLAY" in name]:
             environment.delenv(name)  # the viewer opens in a browser
         values = live.settings(speed=2.0, horizon_s=DISTURBED_S)
-        running = start(*live.AT_RATE, *values, "--live", viewer=True)
+        running = start(*live.AT_RATE, *values, "--live", viewer=True, impatient=True)
         running.wait_recording()
         viewers = viewers_of(running)
         (group,) = {os.getpgid(viewer.pid) for viewer in viewers}

@@ -44,8 +44,6 @@ from tests.helpers.live_runs import (
     start_runs,
     wait_for,
 )
-from tests.oracles.explained_run.explain import explains
-from tests.oracles.explained_run.findings import SCHEDULE
 
 pytestmark = pytest.mark.live
 
@@ -55,7 +53,7 @@ CERTIFIED = "certified for the scenario's plant"
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     with start_runs(tmp_path_factory.mktemp("finished")) as begin:
-        return begin(*settings(speed=2.5, horizon_s=10.0), viewer=True).finish()
+        return begin(*settings(speed=2.5, horizon_s=4.0), viewer=True).finish()
 
 
 @pytest.fixture(scope="module")
@@ -100,12 +98,6 @@ def test_the_run_is_replayed_bit_for_bit(record: RunRecord, finished: Finished) 
     assert all(hop.compared == hop.received > 0 for hop in result.messages)
     assert finished.loop["replay"] == result.verdict().model_dump()
     assert finished.summary["kind"] == record.kind == "live"
-
-
-def test_the_model_explains_the_run(record: RunRecord) -> None:
-    """All but the times of the schedule, which a late machine exceeds."""
-    findings = [finding for finding in explains(record) if finding.part != SCHEDULE]
-    assert not findings, "\n".join(map(str, findings[:5]))
 
 
 def test_the_recording_shows_the_record(finished: Finished, record: RunRecord) -> None:
@@ -166,7 +158,7 @@ def changed(tmp_path_factory: pytest.TempPathFactory) -> ChangedRun:
     folder = tmp_path_factory.mktemp("changed")
     with start_runs(folder) as begin, pytest.MonkeyPatch.context() as patched:
         patched.setenv("XDG_RUNTIME_DIR", str(folder))
-        running = begin(*AT_RATE, *settings(horizon_s=1000.0))
+        running = begin(*AT_RATE, *settings(speed=4.0, horizon_s=1000.0))
         running.wait_recording()
         early_summary = invoke("summary", running.runs / "latest")
         first = set_parameters("loss.p", "0.5", "mansd=2")
@@ -227,7 +219,7 @@ def test_changes_are_recorded_and_are_no_violation(changed: ChangedRun) -> None:
 
 
 RATE_HZ = 5.0
-HORIZON_S = 5.0
+HORIZON_S = 4.0
 ENOUGH_S = 2.5
 SAME = {
     PLANT_STEP: ("input", "sequence", "t_ns", "actuation"),
