@@ -51,14 +51,16 @@ settings.register_profile(
 settings.load_profile("noack")
 
 
-LIVE_TESTS = Path(__file__).parent / "integration"
+TESTS = f"{Path(__file__).parent}{os.sep}"
+LIVE_TESTS = f"{TESTS}integration{os.sep}"
 """The one folder that ``make test`` collects for live tests."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        is_own = Path(__file__).parent in item.path.parents  # not of an extension
-        if is_own and LIVE_TESTS not in item.path.parents and item.get_closest_marker("live"):
+        if item.get_closest_marker("live") is None:
+            continue
+        if (path := str(item.path)).startswith(TESTS) and not path.startswith(LIVE_TESTS):
             raise pytest.UsageError(f"{item.nodeid}: a live test belongs into tests/integration")
     if settings().derandomize:
         # Hypothesis would also try constants of the loaded modules, which depend on the tests that
@@ -68,7 +70,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """Spare the garbage collector what is loaded by now: half a million objects that stay."""
-    gc.collect()
     gc.freeze()
     gc.enable()
 
