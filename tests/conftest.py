@@ -195,15 +195,16 @@ def usual_signals() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def _documented(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def unchanged_documented_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all files that the documentation's commands and snippets use, which no test changes."""
     return fill(tmp_path_factory.mktemp("documented"))
 
 
 @pytest.fixture
-def documented_folder(_documented: Path, tmp_path: Path) -> Path:
-    """A folder of its own, with all files that the documentation's commands and snippets use."""
+def documented_folder(unchanged_documented_folder: Path, tmp_path: Path) -> Path:
+    """A copy of this folder."""
     folder = tmp_path / "documented"
-    shutil.copytree(_documented, folder, symlinks=True)
+    shutil.copytree(unchanged_documented_folder, folder, symlinks=True)
     return folder
 
 

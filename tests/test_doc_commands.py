@@ -37,9 +37,9 @@ def parsed(words: list[str]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("command", [command for command in OF_NOACK if "--help" not in command])
 def test_a_command_line_is_understood_and_its_scenario_resolved(
-    command: str, documented_folder: Path, monkeypatch: pytest.MonkeyPatch
+    command: str, unchanged_documented_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(documented_folder)
+    monkeypatch.chdir(unchanged_documented_folder)
     words = words_of(command)
     given = parsed(words)
     if words[0] == "netem":

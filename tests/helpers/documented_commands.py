@@ -37,7 +37,7 @@ RUN = {words_of(command)[0]: command for command in reversed(OF_NOACK) if "--hel
 SHORTER = {
     "simulate": ("--no-report", "--set", "horizon_s=1"),
     "demo": ("--no-report", "--set", "certificate.prove=false"),
-    "campaign": ("--workers", "1", "--draws", "10"),
+    "campaign": ("--workers", "1", "--draws", "3"),
     "adversary": ("--set", "horizon_s=2", "--nodes", "500"),
     "design": ("--draws", "80"),
     "margin": ("--no-period", "--most", "2"),

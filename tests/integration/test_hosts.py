@@ -19,6 +19,7 @@ from tests.helpers import live_runs as live
 from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import Start, wait_for_end
 from tests.helpers.two_hosts import TwoHosts, two_hosts
+from tests.integration.impatient import LEASE_S
 
 pytestmark = [pytest.mark.live, pytest.mark.system]
 
@@ -98,7 +99,7 @@ def chronyc(folder: Path, line: str) -> dict[str, str]:
 TRACKING = "7F000001,a,2,0,{offset_s},0,0,0,0,0,0.0002,0.0003,8,Normal"
 SEVERAL = f"""
 name = "three"
-horizon_s = 4.0
+horizon_s = 2.0
 
 {live.PENDULUM}
 [[loops]]
@@ -141,7 +142,7 @@ def test_several_loops_run_on_hosts_with_different_clocks(
 @pytest.mark.usefixtures("hosts")
 def test_a_clock_that_is_off_violates_causality(start: Start, tmp_path: Path) -> None:
     """The controller's host is 0.3 s ahead, though it states at most 1 ms."""
-    recording = record(start, tmp_path, *live.settings(horizon_s=4.0))
+    recording = record(start, tmp_path, *live.settings(horizon_s=2.0))
     processes = start_processes(start, "controller", module="tests.integration.wall_clock_ahead")
     *_, summary = end_well(*processes, recording)
     (loop,) = summary["loops"]
@@ -162,13 +163,15 @@ def wait_recorded(folder: Path) -> Path:
     return run_dir.resolve()
 
 
-def test_a_partition_of_five_seconds_costs_no_row(start: Start, hosts: TwoHosts, tmp_path: Path) -> None:
+def test_a_partition_longer_than_the_lease_costs_no_row(
+    start: Start, hosts: TwoHosts, tmp_path: Path
+) -> None:
     """The loop works on while the recorder is out of reach; its rows arrive afterwards."""
-    recording = record(start, tmp_path, *live.settings(horizon_s=12.0))
-    processes = start_processes(start, "netem", "controller")
+    recording = record(start, tmp_path, *live.settings(horizon_s=8.0), impatient=True)
+    processes = start_processes(start, "netem", "controller", impatient=True)
     wait_recorded(tmp_path)
     with _cut_off(hosts):
-        time.sleep(5.0)
+        time.sleep(LEASE_S + 1.0)
     *_, summary = end_well(*processes, recording)
     (loop,) = summary["loops"]
     assert loop["replay"]["complete"]
@@ -176,7 +179,7 @@ def test_a_partition_of_five_seconds_costs_no_row(start: Start, hosts: TwoHosts,
     assert loop["missing_samples"] == 0
     assert loop["unintended_losses"] > 0
     ticks = load_record((tmp_path / "runs" / "latest").resolve())["controller_step"]
-    assert len(ticks) == 12 * 500
+    assert len(ticks) == 8 * 500
 
 
 def test_rows_of_a_host_that_stays_out_of_reach_are_added(

@@ -127,7 +127,7 @@ def test_the_recording_is_complete_and_the_stalled_viewer_is_ended(disturbed: Di
 def test_a_run_is_complete_though_its_launcher_was_stopped_across_the_horizon(tmp_path: Path) -> None:
     """Its processes end meanwhile: their last rows and their reports are on disk."""
     with live.start_runs(tmp_path) as start:
-        running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=16.0))
+        running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=10.0))
         running.wait_recording()
         processes = [running.child(role) for role in LOOP_ROLES]
         launcher = psutil.Process(running.process.pid)

@@ -293,7 +293,7 @@ def test_each_proof_is_enough_for_the_exit_status(
 
 def test_a_guarantee_about_a_reference_ends_with_the_run() -> None:
     results = with_proofs(Certificates(resolved("servo_reference")), ("own", "schedule", PROVEN))
-    assert ", up to 16 s, although" in printed(results)
+    assert ", up to 16 s, although" in printed(results, verbose=False)
 
 
 def test_what_is_proven_leaves_nothing_undecided() -> None:
