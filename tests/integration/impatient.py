@@ -6,7 +6,6 @@ role in the environment's ``FROZEN``, if any, stops before it requests admission
 
 import os
 import signal
-import sys
 
 from noack.runtime import end_reasons, join_run
 from noack.runtime.connections import zenoh_session
@@ -34,10 +33,6 @@ def main() -> None:
     from cosim.live import launcher  # the same
 
     launcher._STOP_TIMEOUT_S = 2.0
-    if "--live" in sys.argv:
-        from cosim.output.viewer import recording_viewer  # slow to import
-
-        recording_viewer._END_S = 1.0
     noack()
 
 
