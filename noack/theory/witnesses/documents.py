@@ -574,9 +574,9 @@ class _OutputSearch:
 
         With friction the first coordinates are too far off: a margin there costs much of the bound.
         """
-        is_known = (output, starts) in self._known and not self._is_rough and not self._loop.along
-        work = self._templates.work(output)
-        return is_known or (work > _LARGE and not self._effort.has_room(work))
+        if (work := self._templates.work(output)) > _LARGE:
+            return not self._effort.has_room(work)
+        return (output, starts) in self._known and not self._is_rough and not self._loop.along
 
     def _solve(
         self, search: Search, output: str, decay: float, *, starts: bool, margin: float, accuracy: Accuracy

@@ -1,8 +1,6 @@
 """A plant whose steps are late applies inputs that were computed for a later time than the step's."""
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,42 +8,14 @@ import pytest
 from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.claims.run_certificates import RUN_WORK, scheduled_certificates
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
-from cosim.record.run_record import RunRecord
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import allowed_conditions
-from tests.cosim.simulation.event_scheduler import RANKS, EventScheduler
+from tests.cosim.simulation.late_plant import CASE, STEP_S, late_run
 
-CASE = Path(__file__).parents[3] / "cases" / "lead.toml"
-STEP_S = 0.002
 LATE = 4
 """Steps by which a step is late, at most."""
-
-Lateness = Callable[[int], int]
-"""By how many steps a step of the plant is late, by its number."""
-
-
-class LatePlant(EventScheduler):
-    """A simulation in which steps of the plant are late."""
-
-    late: Lateness
-
-    def _next(self) -> tuple[int, int, str] | None:
-        due = [(self._now_ns, 2, "")] if self._sent else []
-        for role, rank in {**RANKS, "plant": 5}.items():
-            t_ns = self.machines[role].next_deadline_ns()
-            if t_ns is not None:
-                late_s = self.late(round(t_ns * 1e-9 / STEP_S)) * STEP_S if role == "plant" else 0.0
-                due.append((max(t_ns + round(late_s * 1e9), self._now_ns), rank, role))
-        return min(due, default=None)
-
-
-def late_run(late: Lateness, *settings: str) -> RunRecord:
-    run = LatePlant(resolve(load(CASE, list(settings))))
-    run.late = late
-    run.run()
-    return run.record()
 
 
 def worst_lateness(steps: int, alpha: float) -> list[int]:

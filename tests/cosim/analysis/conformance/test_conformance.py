@@ -19,7 +19,7 @@ from noack.core.errors import CallerError
 from noack.proof.files import document_of
 from noack.proof.loop_document import LoopDocument, Naming
 from noack.scenario.resolution import ResolvedRun
-from tests.cosim.analysis.claims.test_late_plant import late_run
+from tests.cosim.simulation.late_plant import late_run
 from tests.helpers.shipped import resolved, shipped
 
 Table = dict[str, Any]
