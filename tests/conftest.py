@@ -121,7 +121,7 @@ def witnesses_are_found_once(tmp_path_factory: pytest.TempPathFactory) -> Iterat
 def nothing_was_found_before(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Hide what was found earlier, by other tests or for the package: it is better than what needs no search."""
+    """Hide what was found earlier, by tests or for the package: it is better than what needs no search."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
     monkeypatch.setattr("cosim.analysis.witness_store.SHIPPED", tmp_path_factory.mktemp("shipped"))
 

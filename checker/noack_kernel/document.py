@@ -9,10 +9,21 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from flint import fmpq
 
-from noack_kernel.exact import Matrix, RejectedError, decimal, rational, read_matrix, square, whole, zeros
+from noack_kernel.exact import (
+    Matrix,
+    RejectedError,
+    beside,
+    decimal,
+    rational,
+    read_matrix,
+    square,
+    whole,
+    zeros,
+)
 
 FORMAT = "noack-hybrid 1"
 MOST_BYTES = 64 * 2**20
@@ -39,6 +50,14 @@ class Corner:
     matrix: Matrix
     input: Matrix
     unknown: tuple[Unknown, ...]
+
+    @cached_property
+    def velocity(self) -> Matrix:
+        """ż as rows of (z, p)."""
+        found = self.matrix
+        for each in self.unknown:
+            found = beside(found, each.column)
+        return found
 
 
 @dataclass(frozen=True)

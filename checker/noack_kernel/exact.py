@@ -7,7 +7,7 @@ is computed in balls: a midpoint of 128 bits with a radius that contains the tru
 import re
 from collections.abc import Iterable, Sequence
 
-from flint import arb, ctx, fmpq, fmpq_mat
+from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 ctx.prec = 128  # bits of a ball's midpoint
 
@@ -173,24 +173,34 @@ def read_matrix(rows: object, height: int | None, width: int) -> Matrix:
     return Matrix(mid, radius)
 
 
+def padded(M: Matrix, more: int) -> Matrix:
+    """Return a square matrix with further rows and columns of zeros."""
+    if not more:
+        return M
+    z = unit_rows(range(M.height), M.height + more)
+    return z.T @ M @ z
+
+
 def is_positive(M: Matrix) -> bool:
     """Return whether all symmetric matrices in M are proven positive semidefinite.
 
-    LDLᵀ in balls has positive pivots. Rows and columns of exact zeros are left out before it.
+    LDLᵀ of M + Mᵀ in balls has positive pivots. Rows and columns of exact zeros are left out before it.
     """
-    size = range(M.height)
-    kept = [i for i in size if not (M.is_zero([i], size) and M.is_zero(size, [i]))]
-    rest = [[_ball(M, i, j) for j in kept] for i in kept]
+    rest = [list(row) for row in arb_mat(M.mid + M.mid.transpose()).tolist()]
+    if M.radius is not None:
+        for row, sizes in zip(rest, (M.radius + M.radius.transpose()).tolist(), strict=True):
+            for j, size in enumerate(sizes):
+                if size != 0:
+                    row[j] += arb(0, arb(size).upper())
+    kept = [i for i, row in enumerate(rest) if not all(entry == 0 for entry in row)]
+    rest = [[rest[i][j] for j in kept] for i in kept]
     for k, pivots in enumerate(rest):
         if not pivots[k] > 0:
             return False
         for i in range(k + 1, len(kept)):
+            if pivots[i] == 0:
+                continue
             factor = pivots[i] / pivots[k]
             for j in range(i, len(kept)):
                 rest[i][j] -= factor * pivots[j]
     return True
-
-
-def _ball(M: Matrix, i: int, j: int) -> arb:
-    mid = arb((M.mid[i, j] + M.mid[j, i]) / 2)
-    return mid if M.radius is None else mid + arb(0, arb(max(M.radius[i, j], M.radius[j, i])).upper())

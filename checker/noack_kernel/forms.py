@@ -29,8 +29,8 @@ from noack_kernel.document import (
 from noack_kernel.exact import (
     Matrix,
     RejectedError,
-    beside,
     is_positive,
+    padded,
     product,
     rational,
     read_matrix,
@@ -159,7 +159,7 @@ class Forms:
     def _of_motion(self, location: Location, corner: Corner) -> Iterator[tuple[str, Matrix]]:
         """R1: −(2 zᵀPż + zᵀP'z + ν zᵀPz) + Σ m q + Σ τ(|p|² − |Rz|²) ⪰ 0: then e^{νt} V does not increase."""
         nodes, forms = self.nodes[location.name], self.P[location.name]
-        z, motion = self._variables(len(corner.unknown)), self._velocity(corner)
+        z, signals = self._variables(len(corner.unknown)), len(corner.unknown)
         for piece in range(max(len(nodes) - 1, 1)):
             slope = zeros(self._document.size, self._document.size)
             if len(nodes) > 1:
@@ -167,7 +167,7 @@ class Forms:
             for end in (piece, piece + 1) if len(nodes) > 1 else (0,):
                 name = f"motion/{location.name}/{end}"
                 P = forms[end]
-                M = product(P @ z, motion) + z.T @ (slope + P.times(self.decay)) @ z
+                M = product(P @ z, corner.velocity) + padded(slope + P.times(self.decay), signals)
                 M = self._with_facts(name, M.times(fmpq(-1)), location.facts, z, corner)
                 yield name, self._within(location, M)
 
@@ -250,14 +250,15 @@ class Forms:
             else:
                 y = output.rows @ z
             if output.velocity is not None:
-                y += output.velocity @ self._velocity(corner)
+                y += output.velocity @ corner.velocity
             units = zeros(document.size, document.size)
             for level, unit in zip(self.levels, (document.decaying, document.constant), strict=True):
                 if unit is not None:
                     units += square(unit_rows([unit], document.size)).times(level)
             for node, P in enumerate(self.P[location.name]):
                 name = f"output/{location.name}/{node}"
-                M = self._with_facts(name, z.T @ (P + units) @ z - square(y), location.facts, z, signals)
+                V = padded(P + units, z.width - z.height)
+                M = self._with_facts(name, V - square(y), location.facts, z, signals)
                 yield name, self._within(location, M)
 
     # Parts of inequalities.
@@ -266,13 +267,6 @@ class Forms:
         """Return z as rows of (z, p), with as many unknown signals p."""
         size = self._document.size
         return unit_rows(range(size), size + signals)
-
-    def _velocity(self, corner: Corner) -> Matrix:
-        """Return ż as rows of (z, p)."""
-        found = corner.matrix
-        for unknown in corner.unknown:
-            found = beside(found, unknown.column)
-        return found
 
     def _with_facts(
         self, name: str, M: Matrix, facts: Sequence[str], z: Matrix, corner: Corner | None
@@ -285,7 +279,9 @@ class Forms:
         if unknown := sorted({*of_facts} - {*facts}):
             raise RejectedError(f"{name}: the fact {unknown[0][:40]!r} does not hold here")
         for fact, value in of_facts.items():
-            M += (z.T @ self._document.facts[fact] @ z).times(_multiplier(name, value))
+            q = self._document.facts[fact]
+            q = z.T @ q @ z if name == "start" else padded(q, z.width - z.height)
+            M += q.times(_multiplier(name, value))
         signals = list(table.get("unknown", []))  # type: ignore[call-overload]
         if corner is None:
             if signals:
