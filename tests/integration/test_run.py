@@ -16,6 +16,7 @@ import pytest
 import rerun.chunk
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
+from cosim.analysis.conformance.run_conformance import conformance_of
 from cosim.analysis.replay import replay
 from cosim.output.viewer import blueprint
 from cosim.record.run_events import changes_of
@@ -98,6 +99,13 @@ def test_the_run_is_replayed_bit_for_bit(record: RunRecord, finished: Finished) 
     assert all(hop.compared == hop.received > 0 for hop in result.messages)
     assert finished.loop["replay"] == result.verdict().model_dump()
     assert finished.summary["kind"] == record.kind == "live"
+
+
+def test_the_run_is_a_run_of_its_loop_document_unless_it_was_late(
+    record: RunRecord, finished: Finished
+) -> None:
+    found = conformance_of(record)
+    assert found.conforms or finished.loop["assumption_violations"], found.verdict
 
 
 def test_the_recording_shows_the_record(finished: Finished, record: RunRecord) -> None:

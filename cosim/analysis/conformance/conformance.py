@@ -34,6 +34,9 @@ CLOCK_NS = 2
 _MOST_HULLS = 300
 """Steps at which the hull of several inputs is tested; a single input is tested at all steps."""
 _TINY = 1e-12
+_PROJECTIONS = 60
+_LEAST_DIRECTION = 0.02
+"""Directions in which signals have a smaller share of their effect are left out."""
 Table = Mapping[str, Any]
 
 
@@ -237,24 +240,24 @@ class _Checked:
             explained = self._explained(rest[:, self._states], free, columns, split, now, then)
             self._require(here, explained, f"{name!r}: no motion of the document leads to what was recorded")
 
+    @staticmethod
     def _explained(
-        self, rest: Vector, free: Vector, columns: Matrix, split: _Split, now: Vector, then: Vector
+        rest: Vector, free: Vector, columns: Matrix, split: _Split, now: Vector, then: Vector
     ) -> Vector:
         """Return which rests are Σ column p with |p| ≤ |Rz|, but for what is ``free``.
 
-        Signals may vary during a step: |Rz| is the larger one of both ends, plus what it changes by.
+        Signals may vary during a step: |Rz| is the larger one of both ends, plus what it changes by. Signals
+        are found by projections in turn, on those that explain the rest and on those within their limits.
         """
         if not columns.shape[1]:
             return np.asarray((np.abs(rest) <= free).all(axis=1))
         sizes = [[np.linalg.norm(z @ R.T, axis=1) for z in (now, then, then - now)] for R in split.rows]
-        limits = np.stack([np.maximum(first, last) + change for first, last, change in sizes])
-        # Signals with parallel columns add up; the directions that are left are independent.
-        directions, groups = _directions(columns)
-        reach = np.stack([np.abs(factors) @ limits[list(which)] for which, factors in groups])
-        needed, *_ = np.linalg.lstsq(directions, rest.T, rcond=None)
-        small = (np.abs(rest.T - directions @ needed) <= free.T).all(axis=0)
-        room = free.max(axis=1) / np.linalg.norm(directions, axis=0).min()
-        return np.asarray(small & (np.abs(needed) <= reach + room).all(axis=0))
+        limits = np.stack([np.maximum(first, last) + change for first, last, change in sizes], axis=1)
+        scaled = columns * limits[:, None, :]  # (steps, coordinates, signals)
+        inverse, p = np.linalg.pinv(scaled, rcond=_LEAST_DIRECTION), np.zeros((*limits.shape, 1))
+        for _ in range(_PROJECTIONS):
+            p = np.clip(p + inverse @ (rest[:, :, None] - scaled @ p), -1.0, 1.0)
+        return np.asarray((np.abs(rest - (scaled @ p)[:, :, 0]) <= free).all(axis=1))
 
     def _inputs(self, name: str, split: _Split, at: Vector) -> None:
         u = self._trace.u[np.array(self._trace.steps)[at]]
@@ -333,25 +336,6 @@ class _Checked:
     def _require_near(self, index: int, found: Vector, expected: Vector, what: str) -> None:
         if (np.abs(found - expected) > STATE * (1 + np.abs(expected))).any():
             raise RefutedError(float(self._t_s[index]), f"{what} is another one")
-
-
-def _directions(columns: Matrix) -> tuple[Matrix, list[tuple[list[int], Vector]]]:
-    """Return independent directions of columns, and for each the columns along it with their factors."""
-    directions: list[Vector] = []
-    groups: list[tuple[list[int], list[float]]] = []
-    for index, column in enumerate(columns.T):
-        size = float(np.linalg.norm(column))
-        for direction, (which, factors) in zip(directions, groups, strict=True):
-            factor = float(direction @ column)
-            if np.linalg.norm(column - factor * direction) <= 1e-9 * size:
-                which.append(index)
-                factors.append(factor)
-                break
-        else:
-            if size:
-                directions.append(column / size)
-                groups.append(([index], [size]))
-    return np.array(directions).T.reshape(len(columns), -1), [(w, np.array(f)) for w, f in groups]
 
 
 def _in_hull(corners: Matrix, u: Vector, room: Vector) -> bool:

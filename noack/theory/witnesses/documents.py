@@ -476,6 +476,8 @@ class _OutputSearch:
             yield False, coarse
             search = Search(self._templates, refined(search.frames, coarse))
             del attempts[0]
+        elif self._templates.work(output) > _LARGE:  # a margin in the first ones costs much
+            search = Search(self._templates, refined(search.frames, coarse))
         last = coarse
         for index, (margin, accuracy) in attempts:
             found = self._solve(search, output, decay, starts=starts, margin=margin, accuracy=accuracy)

@@ -1,0 +1,54 @@
+"""``noack conform``, from the command line."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from noack.core.errors import ExitStatus
+from tests.helpers.command_line import invoke
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    for name in ("unstable_pendulum", "lane_acknowledged"):
+        words = ("--no-report", "--set", "horizon_s=2", "--runs", folder / name)
+        assert invoke("simulate", name, *words).exit_code == ExitStatus.OK
+    return folder
+
+
+def test_a_run_conforms(runs: Path) -> None:
+    result = invoke("conform", "--runs", runs / "unstable_pendulum", "--json")
+    found = json.loads(result.stdout)
+    assert (result.exit_code, found["conforms"], found["reason"]) == (ExitStatus.OK, True, "")
+    assert found["transitions"]["0 lost, silent"] > 100
+    printed = " ".join(invoke("conform", "--runs", runs / "unstable_pendulum").output.split())
+    assert "the run is a run of its loop document; " in printed
+
+
+def test_the_document_may_be_that_of_all_plants(runs: Path) -> None:
+    assert (
+        invoke("conform", "--runs", runs / "unstable_pendulum", "--plants", "box").exit_code == ExitStatus.OK
+    )
+
+
+def test_a_run_that_another_loop_made_is_refuted(runs: Path) -> None:
+    """The scenario of the record is changed: its document has another threshold."""
+    (path,) = (runs / "unstable_pendulum").glob("2*/scenario.toml")
+    text = path.read_text()
+    try:
+        path.write_text(text.replace("beta = 0.02", "beta = 0.0199"))
+        result = invoke("conform", path.parent, "--json")
+    finally:
+        path.write_text(text)
+    if result.exit_code == ExitStatus.CALLER:  # no proof of the other loop is known
+        assert "there is no" in result.stderr
+        return
+    assert (result.exit_code, json.loads(result.stdout)["conforms"]) == (ExitStatus.FAILED, False)
+
+
+def test_a_run_without_a_document_is_refused_in_one_line(runs: Path) -> None:
+    result = invoke("conform", "--runs", runs / "lane_acknowledged")
+    assert result.exit_code == ExitStatus.CALLER
+    assert "there is no proof that the run could be compared with" in result.stderr
