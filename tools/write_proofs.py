@@ -17,7 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 MOST_GROWTH = 1.03
-MOST_WORK = 200.0
+MOST_WORK = 400.0
 """Some problems are 17 · 10⁹ products per step of the solver: those of the F-16."""
 
 

@@ -1,6 +1,7 @@
 """The conformance of a recorded loop with the loop document of its scenario's bounds."""
 
 from cosim.analysis.claims.common_end import up_to_common_end
+from cosim.analysis.claims.reference_deviations import deviations
 from cosim.analysis.conformance.conformance import Conformance, compare
 from cosim.analysis.conformance.trace import trace_of
 from cosim.analysis.loop_files import naming_of
@@ -9,6 +10,7 @@ from cosim.record.run_record import RunRecord
 from noack.core.errors import CallerError
 from noack.proof.files import document_of
 from noack.proof.loop_document import NoDocumentError
+from noack.scenario.resolution import loop_of
 
 
 def conformance_of(record: RunRecord, plants: str | None = None) -> Conformance:
@@ -36,6 +38,9 @@ def conformance_with(record: RunRecord, statement: WitnessedStatement) -> Confor
         raise CallerError(f"there is no proof that the run could be compared with: {statement.reason}")
     try:
         document = document_of(statement.loop, statement.document, naming_of(record.scenario, statement))
-        return compare(trace_of(up_to_common_end(record), document), document.table)
+        whole = up_to_common_end(record)
+        if (reference := loop_of(record.scenario).reference) is not None:
+            whole = deviations(whole, reference)
+        return compare(trace_of(whole, document), document.table)
     except NoDocumentError as error:
         raise CallerError(f"there is no loop document: {error}") from None

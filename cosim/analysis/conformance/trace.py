@@ -16,6 +16,7 @@ from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASURE
 from noack.theory.witnesses.coordinates import floats
 
 Numbers = NDArray[np.int64]
+_PROJECTIONS = 200
 
 
 class Item(NamedTuple):
@@ -62,8 +63,8 @@ def trace_of(record: RunRecord, document: LoopDocument) -> Trace:
         CallerError: the document has parts that the record does not show, or the record is too short.
     """
     loop = document.loop
-    if loop.observer is not None or loop.loads or loop.offset != 0 or loop.until is not None:
-        raise CallerError("a loop with an observer, a load or a reference is not compared yet")
+    if loop.loads or loop.until is not None or loop.offset != 0:
+        raise CallerError("a loop with a load, or with a reference that moves, is not compared yet")
     if document.model.is_by_tests or not (loop.times.sampling > 0 or document.model.is_periodic):
         raise CallerError("a document with tests at exact times, or at all times, is not compared yet")
     return _Tracer(record, document).trace()
@@ -235,10 +236,12 @@ class _Tracer:
         seen = floats(model.error_rows[0]).shape[0]
         reduce = np.eye(len(x)) if model.sees_all else floats(document.loop.seen or document.loop.gain)
         assert reduce.shape[0] == seen
+        smooth, decaying = self._smooth(state.step)
+        parts.append((model.s, smooth))
         if model.is_periodic and is_lost:
-            parts.append((model.error_rows[0], reduce @ (acting - x)))
+            parts.append((model.error_rows[0], reduce @ (acting - x - decaying)))
         else:
-            parts.append((model.error_rows[0], reduce @ (newest - x)))
+            parts.append((model.error_rows[0], reduce @ (newest - x - decaying)))
             if state.acting >= 0:
                 parts.append((model.error_rows[1], reduce @ (acting - newest)))
         if state.following >= 0:
@@ -252,16 +255,40 @@ class _Tracer:
         z[-2], z[-1] = np.exp(-float(document.rate) * t_s), 1.0
         return z[document.used]
 
+    def _smooth(self, step: int) -> tuple[Vector, Vector]:
+        """Return s, the decaying error of an observer's estimate, and its part of the estimate."""
+        smooth = self._model.bounds.smooth
+        if not self._model.s.nrows():
+            return np.zeros(0), np.zeros(len(self._x[0]))
+        moved = exponential(floats(smooth.rates) * (self._t_ns[step] * 1e-9))
+        s = moved @ floats(smooth.start)[:, 0]
+        return s, floats(smooth.columns) @ s
+
     def _add_noise(self, trace: Trace, states: list[_State]) -> None:
-        """Set the noise of each state that a test reads: what was measured, minus x."""
+        """Set the noise of each state that a test reads: what was measured, minus x and what decays."""
         model = self._model
         if not model.sources:
             return
-        columns = np.linalg.pinv(floats(model.bounds.columns))
+        columns, rate = floats(model.bounds.columns), float(self._document.rate)
         at = [self._document.used.index(c) for c in model.sources]
         for i, (item, state) in enumerate(zip(trace.items, states, strict=False)):
-            if not item.is_motion and state.step in self._tests:
-                trace.z[i, at] = columns @ (self._measured[self._tests[state.step]] - self._x[state.step])
+            if (i == 0 or not item.is_motion) and state.step in self._tests:
+                noise = self._measured[self._tests[state.step]] - self._x[state.step]
+                limits = np.ones(columns.shape[1])
+                limits[: model.bounds.decaying] = np.exp(-rate * self._t_ns[state.step] * 1e-9)
+                trace.z[i, at] = _within(columns, noise - self._smooth(state.step)[1], limits)
+
+
+def _within(columns: Vector, noise: Vector, limits: Vector) -> Vector:
+    """Return p with Σ column p = noise, within its limits if projections in turn find such a p."""
+    inverse = limits[:, None] * np.linalg.pinv(columns * limits)
+    p = inverse @ noise
+    for _ in range(_PROJECTIONS):
+        if (np.abs(p) <= limits).all():
+            break
+        p = np.clip(p, -limits, limits)
+        p = p + inverse @ (noise - columns @ p)
+    return np.asarray(p)
 
 
 def _kind(name: str) -> str:

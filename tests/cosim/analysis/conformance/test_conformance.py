@@ -4,6 +4,7 @@ import contextlib
 import copy
 import re
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,12 @@ from cosim.analysis.witnesses import find_statement
 from cosim.shipped_files import shipped_names
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix
 from noack.proof.files import document_of
 from noack.proof.loop_document import LoopDocument, Naming
 from noack.scenario.resolution import ResolvedRun
+from tests.checker.loops import FILTERED_MASS
+from tests.checker.proofs import proved
 from tests.cosim.simulation.late_plant import late_run
 from tests.helpers.shipped import resolved, shipped
 
@@ -59,14 +63,19 @@ def scaled(value: Any, factor: float) -> Any:
     return [scaled(each, factor) for each in value] if isinstance(value, list) else factor * float(value)
 
 
+def numbers(rows: list[list[Any]]) -> Matrix:
+    """Return a matrix of a document, of intervals their middles."""
+    return np.array(
+        [[np.mean([float(Fraction(v)) for v in np.ravel(entry)]) for entry in row] for row in rows]
+    )
+
+
 def push_harder(document: Table) -> None:
     """B is 1 % larger: so is the share of u in ẋ, and less in ė."""
     for corner in corners(document):
-        U = np.array([[np.mean(entry) for entry in row] for row in corner["input"]])
-        B = np.array([[row[2]] for row in [[0, 0, 0]] * len(corner["matrix"])], dtype=float)
+        B = np.zeros((len(corner["matrix"]), 1))
         B[1], B[3] = 0.01, -0.01
-        F = np.array([[np.mean(entry) for entry in row] for row in corner["matrix"]]) + B @ U
-        corner["matrix"] = F.tolist()
+        corner["matrix"] = (numbers(corner["matrix"]) + B @ numbers(corner["input"])).tolist()
 
 
 def lose_fewer(document: Table) -> None:
@@ -159,6 +168,22 @@ def test_a_run_whose_plant_steps_late_is_refuted_where_an_input_is_for_a_later_t
     found = conformance_with(record, statement)
     assert not found.conforms
     assert re.search("input is none that the document allows|lasts longer than", found.reason), found.reason
+
+
+@pytest.mark.parametrize(
+    ("stored", "settings"),
+    [
+        pytest.param("filtered_mass", FILTERED_MASS, id="Kalman filter"),
+        pytest.param(
+            "claims", ("controller.setpoint=[0.3,0.0]", "plant.initial_state=[1.3,0.0]"), id="set-point"
+        ),
+    ],
+)
+def test_runs_with_an_estimate_or_a_set_point_conform(stored: str, settings: tuple[str, ...]) -> None:
+    statement = proved(stored).statement._replace(loop=proved(stored).loop)
+    record = simulate(resolved("double_integrator", *settings, "horizon_s=4"))
+    found = conformance_with(record, statement)
+    assert found.conforms, found.verdict
 
 
 @pytest.mark.deep
