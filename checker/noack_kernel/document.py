@@ -353,9 +353,24 @@ class Document:
         less = rational(entry["less"])
         if less <= 0 or {*self.outputs[name].locations} != {*self.locations}:
             raise RejectedError(f"while {name}: not above 0, or the output is not one of all locations")
-        if self.outputs[name].velocity is not None:
-            raise RejectedError(f"while {name}: a velocity may jump at any time")
+        if not self._is_continuous(self.outputs[name]):
+            raise RejectedError(
+                f"while {name}: a velocity, noise or a mixture of inputs may jump at any time"
+            )
         return Limit(name, less)
+
+    def _is_continuous(self, output: Output) -> bool:
+        """Return whether an output is continuous between edges."""
+        every = range(self.size)
+        if output.velocity is not None:
+            return False
+        if output.rows is not None:
+            return output.rows.is_zero(range(output.rows.height), self.noise)
+        for name in output.locations:
+            first, *others = [c.input.take([output.input or 0], every) for c in self.locations[name].motion]
+            if not first.is_zero([0], self.noise) or not all(each.equals(first) for each in others):
+                return False
+        return True
 
     def _read_reading(self, name: str, value: object) -> None:
         """Read what a recorded column shows of z. Only a comparison with runs uses it."""

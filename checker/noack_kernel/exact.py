@@ -103,6 +103,10 @@ class Matrix:
         places = [(i, j) for i in rows for j in columns]
         return all(M is None or all(M[place] == 0 for place in places) for M in (self.mid, self.radius))
 
+    def equals(self, other: "Matrix") -> bool:
+        """Return whether the entries are the same, their radii included."""
+        return self.mid == other.mid and self.radius == other.radius
+
     def has_row(self, index: int, entries: dict[int, fmpq]) -> bool:
         """Return whether a row has these entries, exactly, and 0 elsewhere."""
         columns = range(self.width)

@@ -282,7 +282,10 @@ class Forms:
             q = self._document.facts[fact]
             q = z.T @ q @ z if name == "start" else padded(q, z.width - z.height)
             M += q.times(_multiplier(name, value))
-        signals = list(table.get("unknown", []))  # type: ignore[call-overload]
+        of_signals = table.get("unknown", [])
+        if not isinstance(of_signals, list):
+            raise RejectedError(f"{name}: multipliers of signals are no list")
+        signals = [*of_signals]
         if corner is None:
             if signals:
                 raise RejectedError(f"{name}: multipliers of signals, of which there are none")

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from pathlib import Path
 
 from flint import arb, fmpq
@@ -13,6 +14,9 @@ from noack_kernel.forms import Forms
 
 FORMAT = "noack-forms 1"
 _DIGITS = 6
+_PLAIN_NAME = re.compile(r"[\w' -]+")
+_PLAIN_UNIT = re.compile(r"(1/)?[^\W\d][^\s|≤,;]{,19}|[%°][^\s|≤,;]{,9}|")
+"""Names and units that cannot be taken for a part of a sentence; others are quoted."""
 
 
 @dataclass(frozen=True)
@@ -32,31 +36,33 @@ class Statement:
     """So many were verified."""
 
     @property
-    def decaying(self) -> float:
+    def decaying(self) -> Decimal:
         """D1, rounded up."""
-        return rounded_up(self.levels[0])
+        return root_above(self.levels[0])
 
     @property
-    def constant(self) -> float:
+    def constant(self) -> Decimal:
         """D2, rounded up."""
-        return rounded_up(self.levels[1])
+        return root_above(self.levels[1])
 
     @property
-    def largest(self) -> float:
+    def largest(self) -> Decimal:
         """(D1² + D2²)^½, rounded up: a bound at all times."""
-        return rounded_up(self.levels[0] + self.levels[1])
+        return root_above(self.levels[0] + self.levels[1])
 
     def __str__(self) -> str:
         parts = []
         if self.levels[0] > 0:
-            rate = float(arb(self.rate).mid())
-            parts.append(f"{self.decaying:.{_DIGITS}g}" + (f" e^(−{rate:.{_DIGITS}g} t)" if rate else ""))
+            decay = f" e^(−{_rounded(self.rate, ROUND_FLOOR):g} t)" if self.rate > 0 else ""
+            parts.append(f"{self.decaying:g}{decay}")
         if self.levels[1] > 0 or not parts:
-            parts.append(f"{self.constant:.{_DIGITS}g}")
-        unit = f" {self.unit}" if self.unit else ""
+            parts.append(f"{self.constant:g}")
+        name = self.output if _PLAIN_NAME.fullmatch(self.output) else repr(self.output)
+        unit = self.unit if _PLAIN_UNIT.fullmatch(self.unit) else repr(self.unit)
+        unit = f" {unit}" if unit else ""
         when = "at all times" if self.from_start else "in the limit t → ∞"
         where = "" if self.locations is None else f", in the locations {', '.join(map(repr, self.locations))}"
-        return f"|{self.output}| ≤ {' + '.join(parts)}{unit} {when}{where}"
+        return f"|{name}| ≤ {' + '.join(parts)}{unit} {when}{where}"
 
 
 def prove(document: str, proof: str) -> list[Statement]:
@@ -111,14 +117,13 @@ def _require_limits(loop: Document, found: list[Statement]) -> None:
             )
 
 
-def rounded_up(squared: fmpq) -> float:
+def root_above(squared: fmpq) -> Decimal:
     """Return a root of a number ≥ 0 with six digits, not below it."""
-    root = arb(squared).sqrt().upper()
-    shown = float(f"{float(root):.{_DIGITS - 1}e}")
-    step = 10.0 ** (1 - _DIGITS)
-    while not arb(shown) >= root:
-        shown = float(f"{shown * (1 + step):.{_DIGITS - 1}e}")
-    return shown
+    return _rounded(arb(squared).sqrt().upper().fmpq(), ROUND_CEILING)
+
+
+def _rounded(value: fmpq, rounding: str) -> Decimal:
+    return Context(prec=_DIGITS, rounding=rounding).divide(Decimal(int(value.p)), Decimal(int(value.q)))
 
 
 def lines_of_kernel() -> int:

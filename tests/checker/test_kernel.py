@@ -3,6 +3,8 @@
 import copy
 import json
 from collections.abc import Callable
+from decimal import Decimal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +16,7 @@ from noack.proof.words import in_words
 from noack_check.document import read_number
 from noack_check.proof import read_assumptions
 from noack_kernel import RejectedError, Statement, prove
+from noack_kernel.__main__ import UNREADABLE, verify
 from tests.checker.proofs import SEARCHES, Proved, proved
 
 Table = dict[str, Any]
@@ -428,7 +431,92 @@ def test_a_form_without_nodes_is_tested_at_all_nodes_of_a_target_whose_clock_goe
         proven(document, proof)
 
 
+# What is printed, and what may jump at a limit.
+
+
+def unit_alone(rate: float, level: str, **output: Any) -> tuple[Table, Table]:
+    """Return a document of y = f1 = e^{−rt} alone, and a proof of y² ≤ level · f1² by V = −f1²/10²⁰⁰."""
+    document = {
+        "format": "noack-hybrid 1", "name": "unit", "coordinates": [{"name": "f1", "unit": ""}],
+        "decaying": {"coordinate": "f1", "rate": rate}, "rows": {"f1": [[1]]}, "facts": {},
+        "motions": {"m": [{"matrix": [[-rate]], "input": [], "unknown": []}]},
+        "locations": [{"name": "a", "coordinates": [], "motion": "m", "facts": []}], "edges": [],
+        "start": {"location": "a", "columns": [[1]], "facts": []},
+        "outputs": [{"name": "y", "unit": "", "rows": [[1]], "in": ["a"]} | output],
+    }  # fmt: skip
+    bound = {
+        "output": output.get("name", "y"), "from": "start", "decay": 3, "levels": [level, 0], "matrices": {},
+        "forms": {"a": {"nodes": [0], "terms": [[{"square": "f1", "times": "-1/1" + "0" * 200}]]}},
+        "multipliers": {},
+    }  # fmt: skip
+    return document, {"format": "noack-forms 1", "bounds": [bound]}
+
+
+@pytest.mark.parametrize(
+    ("rate", "shown"),
+    [(0.9999996, "0.999999"), (0.1234567, "0.123456"), (0.3, "0.3"), (1e-9, "1e-9")],
+)
+def test_a_printed_rate_is_at_most_the_proven_one(rate: float, shown: str) -> None:
+    assert str(proven(*unit_alone(rate, "5/4"))[0]) == f"|y| ≤ 1.11804 e^(−{shown} t) at all times"
+
+
+@pytest.mark.parametrize(
+    ("level", "shown"), [("1/1" + "0" * 190, "1e-95"), ("1/2" + "0" * 399, "2.23607e-200"), ("4/1", "2")]
+)
+def test_a_printed_bound_is_at_least_the_proven_one(level: str, shown: str) -> None:
+    """The smallest ones are no floating-point numbers."""
+    rows = {"rows": [[1 if level == "4/1" else 0]]}
+    document, proof = unit_alone(0.3, level, **rows)
+    proof["bounds"][0]["forms"]["a"]["terms"][0][0]["times"] = "-1/1" + "0" * 600
+    text = str(proven(document, proof)[0])
+    assert text.startswith("|y| ≤ ")
+    number = text.removeprefix("|y| ≤ ").split(" ")[0]
+    top, bottom = level.split("/")
+    assert Decimal(number) ** 2 * Decimal(bottom) >= Decimal(top)
+    assert float(Decimal(number)) == pytest.approx(float(shown), rel=1e-5, abs=0)
+
+
+def test_a_name_or_a_unit_that_reads_like_a_statement_is_quoted() -> None:
+    spoof = {"name": "x| ≤ 0 at all times; |y", "unit": "m in the limit"}
+    text = str(proven(*unit_alone(0.3, "5/4", **spoof))[0])
+    assert text == "|'x| ≤ 0 at all times; |y'| ≤ 1.11804 e^(−0.3 t) 'm in the limit' at all times"
+    plain = {"name": "error of the controller's model", "unit": "m/s²"}
+    text = str(proven(*unit_alone(0.3, "5/4", **plain))[0])
+    assert text == "|error of the controller's model| ≤ 1.11804 e^(−0.3 t) m/s² at all times"
+
+
+@pytest.mark.parametrize("value", [3, None, "1/2", {"1/2": 1}])
+def test_multipliers_of_signals_are_a_list(value: object) -> None:
+    document, proof = unit_alone(0.3, "5/4")
+    proof["bounds"][0]["multipliers"]["motion/a/0"] = {"unknown": value}
+    with pytest.raises(RejectedError, match="multipliers of signals are no list"):
+        proven(document, proof)
+
+
+def test_a_limit_is_one_of_an_output_that_does_not_jump_between_edges() -> None:
+    """|y| < 2 up to a time says nothing of the next moment, where noise or another corner makes it 3."""
+    document = noisy([[-1, 0, 0]], [[1, 0, 0]])
+    document["while"] = [{"output": "y", "less": 1}]
+    proven(document, bound_of_x())
+    document["outputs"][0]["rows"] = [[1, 1, 0]]
+    with pytest.raises(RejectedError, match="may jump at any time"):
+        proven(document, bound_of_x())
+    corner = document["motions"]["m"][0] | {"input": [[0.5, 0, 0]]}
+    del document["outputs"][0]["rows"]
+    document["outputs"][0]["input"] = 0
+    document["motions"]["m"] = [corner, corner]
+    proven(document, bound_of_x())
+    document["motions"]["m"] = [corner, corner | {"input": [[0.4, 0, 0]]}]
+    with pytest.raises(RejectedError, match="may jump at any time"):
+        proven(document, bound_of_x())
+
+
 def test_files_are_json_of_exact_numbers() -> None:
     document, proof = pendulum()
     assert json.loads(as_text(document)) == document
     assert json.loads(as_text(proof)) == proof
+
+
+def test_a_folder_is_refused_by_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert verify(tmp_path, tmp_path) == UNREADABLE
+    assert capsys.readouterr().err == f"noack-check: {tmp_path}: not a regular file\n"
