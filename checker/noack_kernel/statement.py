@@ -14,7 +14,7 @@ from noack_kernel.forms import Forms
 
 FORMAT = "noack-forms 1"
 _DIGITS = 6
-_PLAIN_NAME = re.compile(r"[\w' -]+")
+_PLAIN_NAME = re.compile(r"[\w' ()-]+")
 _PLAIN_UNIT = re.compile(r"(1/)?[^\W\d][^\s|≤,;]{,19}|[%°][^\s|≤,;]{,9}|")
 """Names and units that cannot be taken for a part of a sentence; others are quoted."""
 

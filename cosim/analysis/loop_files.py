@@ -39,7 +39,7 @@ def files_of_widest(resolved: Scenario, witnesses: Witnesses) -> ProofFiles:
 def naming_of(resolved: Scenario, statement: WitnessedStatement) -> Naming:
     """Return how the document of a statement names its loop."""
     loop = loop_of(resolved)
-    units = dict(zip(loop.state_names, resolved.model.state_units or (), strict=False))
-    units |= {output.name: output.unit for output in loop.outputs}
     of = f"{resolved.name}: {_PLANTS[statement.plants]} under {_CONDITIONS[statement.conditions]}"
-    return Naming(of, loop.state_names, [output.name for output in loop.outputs], units)
+    outputs = [output.name for output in loop.outputs]
+    output_units = [output.unit for output in loop.outputs]
+    return Naming(of, loop.state_names, outputs, resolved.model.state_units or (), output_units)

@@ -4,8 +4,9 @@ A document says nothing of a trigger or a network: losses are locations, deliver
 a fact. It has the form of ``noack_check.model``, in which the search finds its proofs.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -40,17 +41,25 @@ class Naming:
         loop: the document's name.
         states: names of the states; those that are missing have numbers.
         outputs: names of the outputs.
-        units: by the name of a state or output, its unit.
+        state_units: units of the states.
+        output_units: units of the outputs. Those that are missing have none.
     """
 
     loop: str
     states: Sequence[str] = ()
     outputs: Sequence[str] = ()
-    units: Mapping[str, str] = field(default_factory=dict)
+    state_units: Sequence[str] = ()
+    output_units: Sequence[str] = ()
 
     def state(self, index: int) -> str:
         """Return the name of a state."""
         return self.states[index] if index < len(self.states) else f"x{index}"
+
+    def unit(self, name: str) -> str:
+        """Return the unit of an output that the search calls "y[0]" or "x[0]"; others have none."""
+        units = {"y": self.output_units, "x": self.state_units}.get(name[0], ()) if "[" in name else ()
+        index = int(name[2:-1]) if units else 0
+        return units[index] if index < len(units) else ""
 
     def output(self, name: str) -> str:
         """Return the name of an output that the search calls "y[0]"."""
@@ -90,6 +99,7 @@ class LoopDocument:
         used = {c for place in self.model.locations for c in place.coordinates} | {*self.model.sources}
         self.used = sorted(used)
         self._select = columns_of(identity(self.model.size), self.used)
+        self._units: dict[int, str] = {}
         self.labels = self._labels()
         self.rows: Table = {}
         self.facts: dict[str, Table] = {}
@@ -128,27 +138,28 @@ class LoopDocument:
     # Coordinates.
 
     def _labels(self) -> dict[int, str]:
-        """Return the name of each coordinate of the model."""
-        model, n, found = self.model, self.loop.n, dict[int, str]()
-        parts = [("", model.x), ("e ", model.error_rows[0]), ("w ", model.error_rows[1])]
-        parts += [(f"v{k} ", rows) for k, rows in enumerate(model.error_rows[2:], 1)]
-        for prefix, rows in parts:
-            for i in range(rows.nrows()):
-                name = self.naming.state(i) if rows.nrows() == n else f"entry {i}"
-                found |= {c: prefix + name for c in range(model.size) if rows[i, c] != 0}
+        """Return the name of each coordinate of the model; one that is taken has a number."""
+        model, n = self.model, self.loop.n
+        found = {model.size - 2: "f1", model.size - 1: "f2"}
         for kind, rows in (("s", model.s), ("n", model.p)):
             found |= {
                 c: f"{kind}{i}" for i in range(rows.nrows()) for c in range(model.size) if rows[i, c] != 0
             }
-        found[model.size - 2], found[model.size - 1] = "f1", "f2"
+        parts = [("", model.x), ("e ", model.error_rows[0]), ("w ", model.error_rows[1])]
+        parts += [(f"v{k} ", rows) for k, rows in enumerate(model.error_rows[2:], 1)]
+        for prefix, rows in parts:
+            for i in range(rows.nrows()):
+                name = prefix + (self.naming.state(i) if rows.nrows() == n else f"entry {i}")
+                for c in (c for c in range(model.size) if rows[i, c] != 0 and c not in found):
+                    found[c] = _untaken(name, found.values())
+                    if rows.nrows() == n:
+                        self._units[c] = self.naming.unit(f"x[{i}]")
         return found
 
     def _coordinate(self, index: int) -> Table:
-        name = self.labels[index]
-        state = name.removeprefix("e ").removeprefix("w ").split(" ", 1)[-1] if name[0] == "v" else name
-        unit = self.naming.units.get(state.removeprefix("e ").removeprefix("w "), "")
         is_noise = index in self.model.sources
-        return {"name": name, "unit": unit} | ({"noise": True} if is_noise else {})
+        entry = {"name": self.labels[index], "unit": self._units.get(index, "")}
+        return entry | ({"noise": True} if is_noise else {})
 
     def _has(self, unit: str) -> bool:
         return any(self.labels[index] == unit for index in self.used)
@@ -398,15 +409,13 @@ class LoopDocument:
         """Return the document's name of each output; a name that is taken has a number."""
         found: dict[str, str] = {}
         for name in outputs:
-            label = self.naming.output(name)
-            taken = [*found.values()].count(label)
-            found[name] = f"{label} ({taken + 1})" if taken else label
+            found[name] = _untaken(self.naming.output(name), found.values())
         return found
 
     def _output(self, name: str) -> Table:
         model, places = self.model, [place.name for place in self.model.locations]
         label = self.output_names[name]
-        found: Table = {"name": label, "unit": self.naming.units.get(label, ""), "in": places}
+        found: Table = {"name": label, "unit": self.naming.unit(name), "in": places}
         if name.startswith("u["):
             return found | {"input": int(name[2:-1])}
         if name == "drift":
@@ -429,6 +438,13 @@ class LoopDocument:
                 if name not in names:
                     raise NoDocumentError(f"the limit of {self.naming.output(name)} has no bound by forms")
                 yield {"output": names[name], "less": quotient(_lower(limit))}
+
+
+def _untaken(name: str, taken: Iterable[str]) -> str:
+    """Return the name, with a number if it is taken."""
+    names = {*taken}
+    more = (f"{name} ({k})" for k in itertools.count(2))
+    return name if name not in names else next(each for each in more if each not in names)
 
 
 def _later(name: str) -> int:

@@ -21,15 +21,16 @@ from tests.checker.proofs import SEARCHES, Proved, proved
 
 Table = dict[str, Any]
 Change = Callable[[Table, Table], None]
+A_LOOP = Naming("a loop")
 WITH_MEMORY = {"tests_dynamic", "tests_held"}
 
 
-def files_of(stored: Proved) -> tuple[Table, Table]:
+def files_of(stored: Proved, naming: Naming = A_LOOP) -> tuple[Table, Table]:
     """Return the loop document and the proof of a stored statement."""
     content, loop = stored.document, stored.loop
     rate, bounds = read_number(content, "rate"), content["bounds"]
     outputs = [bound["output"] for bound in bounds]
-    document = LoopDocument(loop, rate, read_assumptions(loop, rate, content), outputs, Naming("a loop"))
+    document = LoopDocument(loop, rate, read_assumptions(loop, rate, content), outputs, naming)
     return copy.deepcopy((document.table, write_proof(document, bounds)))
 
 
@@ -56,6 +57,20 @@ def test_the_kernel_proves_what_the_checker_proves(name: str) -> None:
 def test_a_rule_with_a_dynamic_variable_has_no_document(name: str) -> None:
     with pytest.raises(NoDocumentError, match="dynamic variable"):
         files_of(proved(name))
+
+
+@pytest.mark.parametrize("state", ["f1", "f2", "e rate", "w rate", "f1 (2)"])
+def test_names_that_a_document_uses_itself_do_not_spoil_it(state: str) -> None:
+    """Names of coordinates differ; the norm of all states has no unit, whatever an output is called."""
+    naming = Naming("a loop", [state, "rate"], ["all states"], ["rad", "rad/s"], ["deg"])
+    document, proof = files_of(proved("pendulum"), naming)
+    texts = [str(statement) for statement in proven(document, proof)]
+    assert texts[0] == "|all states| ≤ 0.398237 e^(−0.3 t) + 0.0121655 at all times"
+    assert texts[1].startswith("|all states (2)| ≤ ")
+    assert texts[1].endswith(" deg at all times")
+    units = {coordinate["name"]: coordinate["unit"] for coordinate in document["coordinates"]}
+    assert units[f"e {state}"] == "rad"
+    assert sorted(units.values()) == sorted(["rad", "rad/s"] * 3 + ["", ""])
 
 
 # Documents and proofs with one fault.
