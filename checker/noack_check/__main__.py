@@ -121,6 +121,8 @@ def check_file(file: Table, given: Table | None, equations: str | None = None) -
         RejectedError: a statement is not proven, or the copy differs from the scenario.
         RefusedError: a key of the scenario is not covered.
     """
+    if "coordinates" in file:
+        raise RejectedError("this is a loop document; its proof is missing: noack-check DOCUMENT PROOF")
     scenario, statements = file.get("scenario"), file.get("statements")
     if given == {}:
         raise RejectedError("--scenario: the file has no key")

@@ -27,7 +27,8 @@ from noack_kernel.exact import (
 
 FORMAT = "noack-hybrid 1"
 MOST_BYTES = 64 * 2**20
-MOST_COORDINATES, MOST_LOCATIONS, MOST_NODES = 60, 200, 64
+MOST_COORDINATES, MOST_LOCATIONS, MOST_EDGES, MOST_NODES = 60, 200, 2000, 64
+MOST_SIGNALS = 200
 MOST_NAME = 200
 MOST_TEXT = 2000
 Table = Mapping[str, object]
@@ -150,7 +151,7 @@ class Document:
         self.locations = {location.name: location for location in found}
         self.edges = [self._edge(entry) for entry in entries(table["edges"], "edges")]
         _unique([location.name for location in found], "locations", MOST_LOCATIONS)
-        _unique([edge.name for edge in self.edges], "edges")
+        _unique([edge.name for edge in self.edges], "edges", MOST_EDGES)
         self._read_start(table["start"])
         outputs = [self._output(entry) for entry in entries(table["outputs"], "outputs")]
         _unique([output.name for output in outputs], "outputs")
@@ -219,6 +220,8 @@ class Document:
         corners = [self._corner(name, entry) for entry in entries(value, f"motion {name}")]
         if not corners:
             raise RejectedError(f"motion {name}: no corner")
+        if any(len(corner.unknown) > MOST_SIGNALS for corner in corners):
+            raise RejectedError(f"motion {name}: more than {MOST_SIGNALS} unknown signals")
         kinds = {(c.input.height, *(u.along is not None for u in c.unknown)) for c in corners}
         if len(kinds) > 1:
             raise RejectedError(f"motion {name}: corners with different inputs or unknown signals")

@@ -152,6 +152,7 @@ def certify(
             print_to_stderr(f"noack: wrote {equations}; compare it with the plant's code")
     if document is not None and proof is not None:
         files = files_of_widest(result.scenario, witnesses)
+        files.verify()
         write_output(document, files.document)
         write_output(proof, files.proof)
         print_to_stderr(f"noack: wrote {document} and {proof}; noack-check {document} {proof} verifies them")
