@@ -52,7 +52,8 @@ def shorter(words: list[str]) -> list[str]:
     more = ["--figure", "errors"] if "pdf" in words else more
     if "horizon_s" in " ".join(words):
         more = more[2:] if words[0] == "adversary" else more[:1]
-    for option in ({*more} & {*words}) - {"--set"}:  # it is given once
+    given = {word for word in {*more} & {*words} if word.startswith("--")}
+    for option in given - {"--set"}:  # an option is given once
         value = 0 if option.startswith("--no-") else 1
         words = words[: words.index(option)] + words[words.index(option) + 1 + value :]
     return [*words, *more]
