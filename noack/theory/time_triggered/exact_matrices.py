@@ -1,4 +1,4 @@
-"""Matrices with bounds of rounding: enclosures in double precision, and 384 binary digits after the point.
+"""Matrices with bounds of rounding: enclosures in double precision, and balls of 512 bits.
 
 :class:`IntervalMatrix`: entries are known up to a radius. A computed product of k terms differs
 from the exact one by at most k u/(1 − k u) times the product of the absolute values, u = 2⁻⁵³, in
@@ -6,15 +6,15 @@ whichever order it is summed (Higham, *Accuracy and Stability of Numerical Algor
 3.1). The bounds themselves are rounded too; they are enlarged by more than that can be, and by more
 than underflow can hide. Stacks of thousands of matrices are one product.
 
-:class:`FixedPointMatrix`: 384 binary digits after the point, with a bound of the error. Products of
-hundreds of steps are computed with them, so that what remains is the rounding of the result to
-double precision. The entries are Python integers, in units of 2⁻³⁸⁴.
+:class:`BallMatrix`: a matrix of balls (python-flint). Products of hundreds of steps are computed with them,
+so that what remains is the rounding of the result to double precision.
 """
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from flint import arb, arb_mat, ctx, fmpq
 from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S
@@ -26,14 +26,10 @@ ENLARGED = 1 + 2.0**-40
 """Exceeds the rounding of a computed radius of up to 8,000 terms."""
 _UNDERFLOW = 1e-290
 """Exceeds what underflow hides of a term."""
-_DIGITS = 384
-"""Binary digits after the point: products of hundreds of steps lose far fewer."""
-_ONE = 1 << _DIGITS
-"""The number 1 in these units."""
+_BITS = 512
+"""Of a ball's midpoint: products of hundreds of steps lose far fewer."""
 _LARGEST_DOUBLE = int(np.finfo(np.float64).max)
 """The largest number in double precision."""
-_TAYLOR_TERMS = 60
-"""Terms of Taylor's series of an exponential with a norm up to 1/16: the remainder is below 2⁻⁵⁰⁰."""
 
 
 class IntervalMatrix(NamedTuple):
@@ -101,58 +97,45 @@ def inverse(matrices: Matrix) -> IntervalMatrix | None:
 
 
 @dataclass(frozen=True)
-class FixedPointMatrix:
-    """A matrix; each entry differs from the exact one by at most its error.
+class BallMatrix:
+    """All matrices whose entries are in balls, with midpoints of 512 bits."""
 
-    One error for all entries would grow in every product, although the products do not.
-    """
+    balls: arb_mat
 
-    entries: NDArray[np.object_]
-    """Integers in units of 2⁻³⁸⁴, an array of objects."""
-    errors: NDArray[np.object_]
-    """In the same unit, of the same shape."""
-
-    def __matmul__(self, other: "FixedPointMatrix") -> "FixedPointMatrix":
+    def __matmul__(self, other: "BallMatrix") -> "BallMatrix":
         """Return the product."""
-        errors = abs(self.entries) @ other.errors + self.errors @ (abs(other.entries) + other.errors)
-        return FixedPointMatrix((self.entries @ other.entries) >> _DIGITS, (errors >> _DIGITS) + 2)
+        with ctx.workprec(_BITS):
+            return BallMatrix(self.balls * other.balls)
 
-    def then(self, later: "FixedPointMatrix") -> "FixedPointMatrix":
+    def then(self, later: "BallMatrix") -> "BallMatrix":
         """Return the product that applies this matrix first, and then a later one."""
         return later @ self
 
-    def __add__(self, other: "FixedPointMatrix") -> "FixedPointMatrix":
-        """Return the sum."""
-        return FixedPointMatrix(self.entries + other.entries, self.errors + other.errors)
-
-    def rows(self, numbers: slice | list[int]) -> "FixedPointMatrix":
+    def rows(self, numbers: slice) -> "BallMatrix":
         """Return some of the rows."""
-        return FixedPointMatrix(self.entries[numbers], self.errors[numbers])
+        return BallMatrix(arb_mat(self.balls.tolist()[numbers]))
 
     def interval(self) -> IntervalMatrix:
         """Return the matrix in double precision, with its error."""
-        # A quotient of integers is rounded correctly.
-        middle, errors = (np.asarray(part / _ONE, np.float64) for part in (self.entries, self.errors))
+        with ctx.workprec(_BITS):
+            pairs = [(float(ball.mid()), float(ball.rad().upper())) for ball in self.balls.entries()]
+        shape = self.balls.nrows(), self.balls.ncols(), 2
+        middle, errors = np.moveaxis(np.array(pairs).reshape(shape), -1, 0)
         return IntervalMatrix(middle, np.abs(middle) * 2.0**-52 + errors * (1 + 1e-9) + 1e-290)
 
 
-def fixed(matrix: Matrix) -> FixedPointMatrix:
-    """Return a matrix of finite doubles; digits beyond the last are dropped."""
-    entries = np.empty(matrix.shape, dtype=object)
-    for index, value in np.ndenumerate(matrix):
-        numerator, denominator = float(value).as_integer_ratio()
-        entries[index] = numerator * _ONE // denominator
-    return FixedPointMatrix(entries, np.full_like(entries, 1))
+def fixed(matrix: Matrix) -> BallMatrix:
+    """Return a matrix of finite doubles, exactly."""
+    return BallMatrix(arb_mat(matrix.tolist()))
 
 
-def stacked(*parts: FixedPointMatrix) -> FixedPointMatrix:
+def stacked(*parts: BallMatrix) -> BallMatrix:
     """Return matrices on top of each other."""
-    entries = np.concatenate([part.entries for part in parts])
-    return FixedPointMatrix(entries, np.concatenate([part.errors for part in parts]))
+    return BallMatrix(arb_mat([row for part in parts for row in part.balls.tolist()]))
 
 
-def exponential(generator: Matrix, dt: int, parts: int = 1) -> FixedPointMatrix:
-    """Return e^{G dt}, with G per second, by Taylor's series and repeated squaring.
+def exponential(generator: Matrix, dt: int, parts: int = 1) -> BallMatrix:
+    """Return e^{G dt}, with G per second.
 
     Args:
         generator: G, (n, n).
@@ -162,21 +145,8 @@ def exponential(generator: Matrix, dt: int, parts: int = 1) -> FixedPointMatrix:
     Raises:
         OverflowError: an entry, or its error, is beyond double precision.
     """
-    whole, per_s = fixed(generator), parts * NS_PER_S
-    scaled = [value * dt // per_s for value in whole.entries.ravel()]
-    norm = sum(abs(value) for value in scaled) or 1
-    halvings = max(norm.bit_length() - _DIGITS + 4, 0)
-    entries = np.empty(generator.shape, dtype=object)
-    entries.ravel()[:] = [value >> halvings for value in scaled]
-    step = FixedPointMatrix(entries, np.full_like(entries, dt // per_s + 3))
-    total = term = fixed(np.eye(len(generator)))
-    for order in range(1, _TAYLOR_TERMS):
-        term = term @ step
-        term = FixedPointMatrix(term.entries // order, term.errors // order + 2)
-        total = total + term
-    total = FixedPointMatrix(total.entries, total.errors + 1)
-    for _ in range(halvings):
-        total = total @ total
-        if max(abs(total.entries).max(), total.errors.max()) >> _DIGITS > _LARGEST_DOUBLE:
-            raise OverflowError  # further squares would take more and more memory
-    return total
+    with ctx.workprec(_BITS):
+        found = (arb_mat(generator.tolist()) * arb(fmpq(dt, parts * NS_PER_S))).exp()
+        if not all(abs(entry).upper() < _LARGEST_DOUBLE for entry in found.entries()):
+            raise OverflowError
+        return BallMatrix(found)
