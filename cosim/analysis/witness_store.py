@@ -63,8 +63,8 @@ class WitnessStore:
         return None
 
     def _read_shipped(self) -> bytes:
-        index = json.loads((SHIPPED / INDEX).read_bytes())
-        return (SHIPPED / index[self.name.removesuffix(".json")]).read_bytes()
+        name: str = json.loads((SHIPPED / INDEX).read_bytes())[self.name.removesuffix(".json")]
+        return (SHIPPED / name).read_bytes()
 
     def write(self, found: StoredSearch, wanted: Sequence[str], most_work: float) -> None:
         """Keep what a search found; without space or permission nothing is kept."""

@@ -21,6 +21,7 @@ from fractions import Fraction
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.optimize import nnls
 
@@ -329,7 +330,7 @@ class _Checked:
     def _size(self) -> float:
         return float(np.abs(self._z[:, self._states]).max()) or 1.0
 
-    def _require(self, at: Vector, holds: Vector, what: str) -> None:
+    def _require(self, at: NDArray[Any], holds: NDArray[Any], what: str) -> None:
         if not holds.all():
             raise RefutedError(float(self._t_s[at[int(np.argmin(holds))]]), what)
 
