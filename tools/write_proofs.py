@@ -79,9 +79,11 @@ def servo(folder: Path) -> Path:
     text = (ROOT / "README.md").read_text()
     program = re.search(r"```python\n(# servo\.py\n.*?)```", text, re.DOTALL)
     assert program is not None
+    from noack.core.system_processes import python_command
+
     (folder / "servo.py").write_text(program[1])
     elsewhere = os.environ | {"XDG_CACHE_HOME": str(folder / "servo")}  # what it tries is no proof of it
-    command = [Path(sys.executable).parent / "noack", "new", "servo.py"]
+    command = python_command("-m", "cosim.cli", "new", "servo.py")
     subprocess.run(command, cwd=folder, check=True, env=elsewhere)
     return folder / "servo.toml"
 

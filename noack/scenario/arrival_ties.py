@@ -20,8 +20,6 @@ WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
 """Kinds of impairments that do not change the delay of a packet."""
 _US = 1000
 """In ns; the later delay is a whole number of µs, as a fraction of a second with few digits."""
-_MOST_RAISES = 100
-"""Each raise passes a tick of one loop; another loop may have one just after it."""
 
 
 def with_later_updates(scenario: Scenario) -> tuple[Scenario, str]:
@@ -81,22 +79,22 @@ def _delayed(stages: Sequence[Impairment], last: Delay, delay_s: float) -> tuple
 def _later_ns(loops: Sequence[Scenario], delay_ns: int, others_ns: int) -> int:
     """Return a delay with which the updates of all loops miss the ticks that are near their arrivals.
 
-    Other delays come before this one.
+    Ticks are near that come at most the live latency after an arrival. Other delays come before this one.
     """
-    for _ in range(_MOST_RAISES):
-        raise_ns = max(_until_after_tick_ns(loop, others_ns + delay_ns) for loop in loops)
-        if not raise_ns:
-            break
-        delay_ns = -(-(delay_ns + raise_ns) // _US) * _US
-    return delay_ns
+    latest_ns = delay_ns + LATENCY_NS
+    while True:
+        ticks_ns = [delay_ns + _until_tick_ns(loop, others_ns + delay_ns) for loop in loops]
+        near_ns = [floor(tick_ns) for tick_ns in ticks_ns if tick_ns <= latest_ns]
+        if not near_ns:
+            return delay_ns
+        delay_ns = -(-(max(near_ns) + 1) // _US) * _US
 
 
-def _until_after_tick_ns(loop: Scenario, delay_ns: int) -> int:
-    """Return by how much later updates miss a tick which is near their arrival; 0 if none is."""
+def _until_tick_ns(loop: Scenario, delay_ns: int) -> Fraction:
+    """Return the least time from the arrival of an update to a tick of the controller."""
     timing = loop.timing
     arrival = Fraction(delay_ns) - timing.exact_controller_phase
-    until_tick = _until_next(arrival, timing.measurement_period.exact, timing.controller_period.exact)
-    return floor(until_tick) + 1 if until_tick <= LATENCY_NS else 0
+    return _until_next(arrival, timing.measurement_period.exact, timing.controller_period.exact)
 
 
 def _until_next(first: Fraction, period: Fraction, other: Fraction) -> Fraction:

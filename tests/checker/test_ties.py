@@ -124,6 +124,12 @@ def test_every_loop_of_a_run_takes_the_later_tick(phase: float, delay_s: float) 
     assert [stage.content()["delay_s"] for stage in scenario.network.impairments] == [delay_s]
 
 
+def test_an_update_is_at_most_the_live_latency_later_if_ticks_are_nearer_to_each_other() -> None:
+    fast = ("controller.rate_hz=20000", "plant.rate_hz=20000", "horizon_s=0.3")
+    (delay,) = with_later_updates(load(CASE, [*fast]))[0].network.impairments
+    assert 0.02515 < delay.content()["delay_s"] <= 0.0252 + 1e-6
+
+
 def test_an_update_without_delay_misses_a_tick_at_its_transmission() -> None:
     scenario, _ = with_later_updates(load(CASE, [*AT_ONCE, "horizon_s=0.3"]))
     assert with_later_updates(scenario) == (scenario, "")

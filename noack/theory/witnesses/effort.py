@@ -7,8 +7,8 @@ from noack.core.progress import Progress
 MOST_WORK = 20.0
 """A search ends after so many 10⁹ products per step of the solver: some minutes."""
 PROBLEMS = 10
-"""A search has work for at least so many problems. A larger problem takes minutes: those of the F-16 under
-its schedule need 9 to 17. In eleven shipped scenarios the largest one is 0.5."""
+"""A usual search has work for at least so many problems. A larger problem takes minutes: those of the F-16
+under its schedule need 9 to 17. In eleven shipped scenarios the largest one is 0.5."""
 _LAST_SHARE = 0.99
 _MANY = 12
 
@@ -43,7 +43,7 @@ class Effort:
 
     def __init__(self, progress: Progress, most_work: float = MOST_WORK) -> None:
         self._progress, self._most_work = progress, most_work
-        self.most_per_problem = most_work / PROBLEMS
+        self.most_per_problem = max(most_work, MOST_WORK) / PROBLEMS
         self._problems, self._expected, self._work, self._share = 0, 0, 0.0, 0.0
 
     def has_room(self, work: float) -> bool:

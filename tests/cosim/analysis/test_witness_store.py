@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from cosim.analysis.witness_store import INDEX, SHIPPED
 from cosim.analysis.witnesses import WitnessedStatement, find_statement
 from noack.theory.witnesses.documents import Witness, witness_by_gains
 from noack.theory.witnesses.effort import NoWitnessError
@@ -19,6 +20,7 @@ from tests.helpers.shipped import resolved
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("cosim.analysis.witness_store.SHIPPED", tmp_path / "none")
     return tmp_path / "noack" / "witnesses"
 
 
@@ -139,3 +141,24 @@ def test_a_folder_that_cannot_be_written_costs_nothing_but_time(
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     assert found().proof is not None
+
+
+def test_a_proof_of_the_package_is_used_without_a_search(
+    folder: Path, searches: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cosim.analysis.witness_store.SHIPPED", SHIPPED)
+    shipped = found()
+    assert shipped.proof is not None
+    assert (searches, folder.exists()) == ([], False)
+    assert found("trigger.beta=0.07").proof is None or searches  # another loop is searched
+
+
+@pytest.mark.parametrize("index", ["", "[]", "{", '{"a": "b"}'])
+def test_a_damaged_index_of_the_package_counts_as_missing(
+    folder: Path, searches: list[float], index: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / INDEX).write_text(index)
+    monkeypatch.setattr("cosim.analysis.witness_store.SHIPPED", tmp_path)
+    assert found().proof is not None
+    assert searches == [20.0]
+    assert folder.exists()
