@@ -24,9 +24,18 @@ _ALL = {
     "x": "all states",
     "e_s": "error of the sensor's model",
     "e_c": "error of the controller's model",
-    "drift": "growth of the sensor's error",
+    "drift": "mismatch of the sensor's model",
 }
 """Names of outputs with several rows."""
+_EDGES = {
+    "sent": "an event, whose update is on its way then",
+    "delivered": "an event, whose update acts at once",
+    "lost": "an event, whose update is lost",
+    "event": "an event while an update is on its way",
+    "silent": "a test without an event",
+    "all lost": "the update that was on its way acts, and all that were sent after it are lost",
+}
+"""What the ends of names of edges mean."""
 
 
 class NoDocumentError(ValueError):
@@ -169,7 +178,7 @@ class LoopDocument:
         model, parts = self.model, []
         prefixes = {self.labels[c].split(" ")[0] for c in self.used}
         parts.append("e is x_s − x, the error of the sensor's model")
-        parts.append("w is x_c − x_s, where the acting input was computed from x_c")
+        parts.append("w is x_c − x_s with the x_c from which the input that acts now was computed")
         if "v1" in prefixes:
             parts.append("v1, v2, ... are what w will be when a later update acts, the newest one first")
         if model.s.nrows():
@@ -181,6 +190,9 @@ class LoopDocument:
         parts.append('"j lost": j updates were sent since the one that acts, and all are lost')
         if any("later" in place.name for place in model.locations):
             parts.append('"k later": an update is on its way, and k were sent after it')
+        names = {kind for edge in model.edges for kind in _EDGES if edge.name.endswith(f", {kind}")}
+        names |= {"silent"} if self.silent_locations else set()
+        parts += [f'"{kind}": {words}' for kind, words in _EDGES.items() if kind in names]
         return ". ".join(parts) + "."
 
     def columns(self, rows: arb_mat) -> list[list[Number | list[float]]]:

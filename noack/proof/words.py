@@ -8,7 +8,11 @@ from typing import Any
 _WIDTH = 108
 _DIGITS = 4
 _MS = 1000
-_CLOCKS = {"zero": "the clock is set to 0", "keeps": "the clock goes on", "any": "the clock may be any"}
+_CLOCKS = {
+    "zero": "the clock is set to 0",
+    "keeps": "the clock goes on",
+    "any": "the clock then has any value that is allowed there",
+}
 Table = Mapping[str, Any]
 
 
@@ -45,15 +49,15 @@ def _lines(document: Table) -> Iterator[str]:
     used = {name for fact in document["facts"].values() for name in (*fact["less"], *fact["more"])}
     for name, fact in document["facts"].items():
         left, right = (" + ".join(f"|{each}|²" for each in fact[side]) or "0" for side in ("less", "more"))
-        yield from _wrapped(f"- {name}: {left} ≤ {right} ({fact['words']})", [], "")
+        yield from _wrapped(f"- {name!r}: {left} ≤ {right} ({fact['words']})", [], "")
     for name in sorted(used & {*document["rows"]}, key=list(document["rows"]).index):
         yield from _wrapped(f"- where {name} = ", [_row(row, names) for row in document["rows"][name]], "; ")
     for name, corners in document["motions"].items():
         yield from _motion(name, corners, document)
-    yield from ("", "## Locations: what may differ from 0, and how long")
+    yield from ("", "## Locations: how z moves, for how long, and what is 0")
     for location in document["locations"]:
         yield from _location(location, document)
-    yield from ("", "## Edges: what may happen")
+    yield from ("", "## Edges: which transitions may happen, when, and what they change")
     inside = {location["name"]: location["coordinates"] for location in document["locations"]}
     for edge in document["edges"]:
         yield from _edge(edge, names, inside[edge["from"]])
@@ -66,24 +70,33 @@ def _lines(document: Table) -> Iterator[str]:
 
 
 def _motion(name: str, corners: Sequence[Table], document: Table) -> Iterator[str]:
+    mixture = f"any mixture of {len(corners)} corners, which may change at any time; corner 1:"
+    yield from ("", f"## Motion {name!r}: {'exactly' if len(corners) == 1 else mixture}")
+    first = dict(_corner(corners[0], document))
+    for text in first.values():
+        yield from _wrapped(f"- {text}", [], "")
+    for number, corner in enumerate(corners[1:], 2):
+        others = [text for key, text in _corner(corner, document) if text != first.get(key)]
+        yield from _wrapped(f"- corner {number} as corner 1, but ", others or ["for rounding"], "; ")
+
+
+def _corner(corner: Table, document: Table) -> Iterator[tuple[str, str]]:
+    """Yield what moves, or is unknown, with its text."""
     names = [coordinate["name"] for coordinate in document["coordinates"]]
-    mixture = "exactly" if len(corners) == 1 else f"any mixture of {len(corners)} corners; the first one:"
-    yield from ("", f"## Motion {name!r}: {mixture}")
     still = {document["decaying"]["coordinate"] if document.get("decaying") else "", document.get("constant")}
     still |= {coordinate["name"] for coordinate in document["coordinates"] if coordinate.get("noise")}
-    corner = corners[0]
     for i, row in enumerate(corner["matrix"]):
         signals = [unknown["column"][i][0] for unknown in corner["unknown"]]
         if names[i] not in still:
             rate = _row([*row, *signals], [*names, *(f"p{k}" for k in range(1, len(signals) + 1))])
-            yield from _wrapped(f"- d/dt {names[i]} = {rate}", [], "")
+            yield names[i], f"d/dt {names[i]} = {rate}"
     for k, unknown in enumerate(corner["unknown"], 1):
         sizes = "; ".join(_row(row, names) for row in unknown["rows"])
         along = ""
         if "along" in unknown:
             least = _number(unknown["least"])
             along = f", and p{k} · ({_row(unknown['along'][0], names)}) ≥ {least} p{k}²"
-        yield from _wrapped(f"- p{k} is unknown: |p{k}| ≤ |{sizes}|{along}", [], "")
+        yield f"p{k} is unknown", f"p{k} is unknown: |p{k}| ≤ |{sizes}|{along}"
 
 
 def _location(location: Table, document: Table) -> Iterator[str]:
@@ -93,11 +106,11 @@ def _location(location: Table, document: Table) -> Iterator[str]:
     missing = [name for name in every if name not in location["coordinates"]]
     parts = [f"moves as {location['motion']!r}"]
     if location.get("clock") is not None:
-        parts.append(f"at most {_time(location['clock'])}")
+        parts.append(f"for at most {_time(location['clock'])}")
     if location["facts"]:
-        parts.append(f"always {', '.join(location['facts'])}")
-    parts.append(f"0 here: {', '.join(missing)}" if missing else "nothing is 0")
-    yield from _wrapped(f"- {location['name']}: ", parts, "; ")
+        parts.append(f"always {_quoted(location['facts'])}")
+    parts.append(f"0 here: {', '.join(missing)}" if missing else "all coordinates may differ from 0")
+    yield from _wrapped(f"- {location['name']!r}: ", parts, "; ")
 
 
 def _edge(edge: Table, names: Sequence[str], inside: Sequence[str]) -> Iterator[str]:
@@ -106,18 +119,16 @@ def _edge(edge: Table, names: Sequence[str], inside: Sequence[str]) -> Iterator[
         is_changed = [_value(v) for v in row] != [int(i == j) for j in range(len(names))]
         if is_changed and (names[i] in inside or any(map(_value, row))):
             changes.append(f"{names[i]} := {_row(row, names)}")
-    parts = [f"from {edge['from']} to {edge['to'] if edge['to'] is not None else 'nowhere: never taken'}"]
+    parts = [f"from {edge['from']!r} to {'nowhere: never taken' if edge['to'] is None else repr(edge['to'])}"]
     if edge.get("when") is not None:
         first, last = edge["when"]
         when = _time(last) if _value(first) == _value(last) else f"{_time(first)} to {_time(last)}"
-        parts.append(f"at {when}")
-    parts.append(
-        {"zero": "the clock is set to 0", "keeps": "the clock goes on", "any": "any clock"}[edge["clock"]]
-    )
+        parts.append(f"when the clock shows {when}")
+    parts.append(_CLOCKS[edge["clock"]])
     if edge["facts"]:
-        parts.append(f"if {', '.join(edge['facts'])}")
+        parts.append(f"if {_quoted(edge['facts'])}")
     parts.append(", ".join(changes) if changes else "nothing changes")
-    yield from _wrapped(f"- {edge['name']}: ", parts, "; ")
+    yield from _wrapped(f"- {edge['name']!r}: ", parts, "; ")
 
 
 def _start(start: Table, names: Sequence[str], noise: Sequence[str]) -> Iterator[str]:
@@ -125,13 +136,13 @@ def _start(start: Table, names: Sequence[str], noise: Sequence[str]) -> Iterator
     for name, row in zip(names, start["columns"], strict=True):
         if name not in noise and any(map(_value, row)):
             values.append(f"{name} = {_row(row, ['', *noise])}")
-    facts = f", {', '.join(start['facts'])}" if start["facts"] else ""
-    yield from _wrapped(f"- starts in {start['location']}{facts} with ", values, ", ")
+    facts = f", if {_quoted(start['facts'])}," if start["facts"] else ""
+    yield from _wrapped(f"- starts in {start['location']!r}{facts} with ", values, ", ")
 
 
 def _output(output: Table, names: Sequence[str], locations: int) -> Iterator[str]:
     unit = f" [{output['unit']}]" if output["unit"] else ""
-    where = "" if len(output["in"]) == locations else f", in {', '.join(output['in'])}"
+    where = "" if len(output["in"]) == locations else f", bounded only in {_quoted(output['in'])}"
     if "input" in output:
         what = f"entry {output['input']} of the input"
     else:
@@ -167,6 +178,10 @@ def _number(entry: Any) -> str:
 
 def _time(entry: Any) -> str:
     return "0" if _value(entry) == 0 else f"{_number(_value(entry) * _MS)} ms"
+
+
+def _quoted(names: Sequence[str]) -> str:
+    return " and ".join(map(repr, names)) if len(names) < 3 else ", ".join(map(repr, names))
 
 
 def _with_unit(coordinate: Table) -> str:
