@@ -60,18 +60,23 @@ class _StoreOnce(argparse.Action):
 
 def main() -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser("noack-check", description="Verify the witnesses of bounds of a loop.")
+    parser = argparse.ArgumentParser(
+        "noack-check",
+        description="Verify the bounds of a loop: from a loop document and a proof, or from witnesses.",
+    )
     parser.add_argument(
         "witness",
+        metavar="document|witness",
         type=Path,
-        help="file that `noack certify NAME --witness FILE` or `noack margin` with --witness has written",
+        help="a loop document, which needs the proof beside it; or a file of witnesses, by `noack certify "
+        "NAME --witness FILE` or `noack margin NAME --witness FILE`",
     )
     parser.add_argument(
         "proof",
         type=Path,
         nargs="?",
-        help="with a loop document as the first file: the proof of its bounds; both by `noack certify NAME "
-        "--document DOCUMENT --proof PROOF`",
+        help="the proof of the document's bounds; `noack certify NAME --document DOCUMENT --proof PROOF` "
+        "writes both",
     )
     parser.add_argument(
         "--scenario", action=_StoreOnce, type=Path, help="the scenario, by `noack check NAME --resolved`"
@@ -123,6 +128,8 @@ def check_file(file: Table, given: Table | None, equations: str | None = None) -
     """
     if "coordinates" in file:
         raise RejectedError("this is a loop document; its proof is missing: noack-check DOCUMENT PROOF")
+    if file.get("format") == "noack-forms 1":
+        raise RejectedError("this is a proof; its loop document goes before it: noack-check DOCUMENT PROOF")
     scenario, statements = file.get("scenario"), file.get("statements")
     if given == {}:
         raise RejectedError("--scenario: the file has no key")

@@ -40,7 +40,7 @@ def verify(document: Path, proof: Path) -> int:
         statements, loop = prove(*texts), Document(texts[0])
         for statement in statements:
             print(printable(f"PROVED {statement}"))
-        print(printable(f"       of the loop document {loop.name!r}"))
+        print(printable(f"       for each run of the loop document {loop.name!r}"))
         print(f"       with the SHA-256 {loop.digest}")
         count = sum(statement.inequalities for statement in statements)
         print(f"       by {count} inequalities, which {lines_of_kernel()} lines of Python verified")

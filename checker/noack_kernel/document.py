@@ -407,7 +407,9 @@ def read_table(text: str, expected: str) -> Table:
     except json.JSONDecodeError as error:
         raise RejectedError(f"not JSON: {error}") from None
     if not isinstance(table, dict) or table.get("format") != expected:
-        raise RejectedError(f'not a file of the format "{expected}"')
+        raise RejectedError(
+            f'not a file of the format "{expected}"; the order is: noack-check DOCUMENT PROOF'
+        )
     return table
 
 

@@ -75,7 +75,7 @@ def prove(document: str, proof: str) -> list[Statement]:
     table = read_table(proof, FORMAT)
     fields(table, "proof", {"format", "bounds"}, {"document"})
     if "document" in table and table["document"] != loop.digest:
-        raise RejectedError("the proof is one of another document, by its digest")
+        raise RejectedError("the proof is one of another document: it names another SHA-256")
     found = [_statement(loop, forms) for forms in _in_order(loop, table["bounds"])]
     if not found:
         raise RejectedError("the proof has no bound")

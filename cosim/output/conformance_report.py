@@ -12,6 +12,7 @@ def conformance_document(found: Conformance, name: str) -> Document:
     return Document(
         title=f"conformance of {name}",
         data={
+            "document": found.document,
             "conforms": found.conforms,
             "until_s": found.until_s,
             "reason": found.reason,
@@ -22,7 +23,7 @@ def conformance_document(found: Conformance, name: str) -> Document:
             Sentence(text=found.verdict, role=SentenceRole.VERDICT, tone=tone, is_prose=True),
             ResultTable(
                 "",
-                "transitions of the document, and how often each occurred",
+                "transitions that the document allows, and how often each occurred",
                 ("transition", "occurred"),
                 [(edge, f"{count:,}") for edge, count in found.edges.items()],
             ),

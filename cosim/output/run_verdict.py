@@ -42,7 +42,7 @@ _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
 _TIMES = {
     "delay_s": "updates that take effect after up to {}",
     "hold_s": "inputs up to {} old",
-    "lead_s": "inputs computed for a time up to {} after their step",
+    "lead_s": "inputs computed up to {} ahead of the step that applies them",
     "start_s": "a first input after up to {}",
 }
 """The times of a certificate, in words."""

@@ -46,5 +46,8 @@ def document_of(loop: Loop, statement: Mapping[str, object], naming: Naming) -> 
 def _bounds(statement: Mapping[str, object]) -> list[Any]:
     bounds = statement.get("bounds")
     if not isinstance(bounds, list) or not bounds:
-        raise NoDocumentError("the bounds are by gains; only bounds by quadratic forms have one")
+        raise NoDocumentError(
+            "the bounds are small-gain bounds, and only bounds by quadratic forms have one; "
+            "noack certify NAME --witness FILE writes what proves them"
+        )
     return bounds

@@ -60,6 +60,8 @@ class Conformance(NamedTuple):
     """How often each edge of the document was taken."""
     clocks: Mapping[str, float]
     """By location, the largest share of its clock's limit that was reached."""
+    document: str
+    """Name of the document."""
 
     @property
     def conforms(self) -> bool:
@@ -72,8 +74,15 @@ class Conformance(NamedTuple):
         taken = sum(count > 0 for count in self.edges.values())
         coverage = f"{taken} of the document's {len(self.edges)} kinds of transitions occurred"
         if self.conforms:
-            return f"the run is a run of its loop document; {coverage}"
-        return f"the run is a run of its loop document until {self.until_s:.6g} s: {self.reason}; {coverage}"
+            return (
+                f"the run is a run of the loop document {self.document!r}, so the bounds that are proved of "
+                f"this document hold for the run; {coverage}"
+            )
+        return (
+            f"the run is a run of the loop document {self.document!r} until {self.until_s:.6g} s only: "
+            f"{self.reason}; from then on the bounds that are proved of this document need not hold; "
+            f"{coverage}"
+        )
 
 
 def compare(trace: Trace, document: Table) -> Conformance:
@@ -90,7 +99,8 @@ def compare(trace: Trace, document: Table) -> Conformance:
     names = [edge["name"] for edge in document["edges"]]
     taken = Counter(item.name for item in trace.items if not item.is_motion)
     counts = {name: taken[name] for name in names}
-    return Conformance(until_s, "" if first is None else first.what, counts, checked.clock_shares())
+    reason = "" if first is None else first.what
+    return Conformance(until_s, reason, counts, checked.clock_shares(), document["name"])
 
 
 @dataclass

@@ -24,7 +24,9 @@ def conformance_of(record: RunRecord, plants: str | None = None) -> Conformance:
         CallerError: no document describes the loop, or it cannot be compared yet; the message says why.
     """
     scenario = record.scenario
-    statement = find_statement(scenario, plants or plants_of(scenario)[0], "schedule", most_work=0.0)
+    if (known := plants_of(scenario)) == ["region"] and plants not in (None, "region"):
+        raise CallerError("--plants: a plant given by equations has one document; leave the option out")
+    statement = find_statement(scenario, plants or known[0], "schedule", most_work=0.0)
     return conformance_with(record, statement)
 
 
@@ -35,7 +37,9 @@ def conformance_with(record: RunRecord, statement: WitnessedStatement) -> Confor
         CallerError: as :func:`conformance_of`.
     """
     if statement.document is None or statement.loop is None:
-        raise CallerError(f"there is no proof that the run could be compared with: {statement.reason}")
+        raise CallerError(
+            f"nothing is proved of the loop, so there is no loop document to compare: {statement.reason}"
+        )
     try:
         document = document_of(statement.loop, statement.document, naming_of(record.scenario, statement))
         whole = up_to_common_end(record)

@@ -64,9 +64,15 @@ def trace_of(record: RunRecord, document: LoopDocument) -> Trace:
     """
     loop = document.loop
     if loop.loads or loop.until is not None or loop.offset != 0:
-        raise CallerError("a loop with a load, or with a reference that moves, is not compared yet")
+        raise CallerError(
+            "a loop with a load, or with a reference that moves, cannot be compared with a loop "
+            "document yet; noack summary shows which claims the run was checked against"
+        )
     if document.model.is_by_tests or not (loop.times.sampling > 0 or document.model.is_periodic):
-        raise CallerError("a document with tests at exact times, or at all times, is not compared yet")
+        raise CallerError(
+            "a loop document with tests at exact times, or at all times, cannot be compared with a run yet; "
+            "noack summary shows which claims the run was checked against"
+        )
     return _Tracer(record, document).trace()
 
 
@@ -89,7 +95,9 @@ class _Tracer:
             self._sent_step = np.append(0, self._sent_step)
             self._sent_x = np.vstack([self._x[:1], self._sent_x])
         if not len(self._sent_step) or self._sent_step[0] != 0 or (knows_start and self._sent_step[1:2] == 0):
-            raise CallerError("a run that does not begin with an event is not compared yet")
+            raise CallerError(
+                "a run that does not begin with an event cannot be compared with a loop document yet"
+            )
         numbers = {int(sequence): i for i, sequence in enumerate(tests["event"][events], int(knows_start))}
         self._acts = self._acting_steps(record, numbers, knows_start=knows_start)
         self._H = floats(document.loop.H)

@@ -175,15 +175,19 @@ def conform(
     runs: opt.RunsOption = DEFAULT_RUNS,
     loop: opt.LoopOption = None,
     plants: Annotated[
-        Plants,
-        Option(help="The document: of the plant itself, or of all plants of its uncertainty (box)."),
-    ] = Plants.OWN,
+        Plants | None,
+        Option(
+            help="Which document: that of the plant itself (own, the default for a linear plant), or that of "
+            "all plants within its uncertainty (box), which noack certify --document writes."
+        ),
+    ] = None,
     json: opt.JsonOption = False,
 ) -> int:
     """Compare a run with the loop document that its bounds are proven of.
 
-    A bound of the document holds of a run that is one of the document's runs. `noack check NAME --document`
-    prints the document. Exit status 1: the run does something that the document does not allow.
+    The loop document says what the loop may do. If the run does nothing else, the proved bounds of the
+    document hold for the run. `noack check NAME --document` prints the document. Exit status 1: the run does
+    something that the document does not allow.
     """
     from cosim.analysis.conformance.run_conformance import conformance_of
     from cosim.output.conformance_report import conformance_document

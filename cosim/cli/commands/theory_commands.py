@@ -142,7 +142,7 @@ def certify(
             raise CallerError("--equations: the plant is linear; its statements need no file of equations")
     with uncovered_as_unmet(require or ()):
         result = certificates_of(loaded, late)
-    with work_bar("searching for proofs" if search else "proving", lines=True) as bar:
+    with work_bar("finding and verifying proofs" if search else "verifying proofs", lines=True) as bar:
         witnesses = result.prove(bar, MOST_WORK if search else 0.0)
     if witness is not None and witnesses.are_any:
         write_output(witness, witnesses.file_text())

@@ -15,6 +15,8 @@ from noack_check.__main__ import main
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import shipped
 
+OF_ANOTHER = "the proof is one of another document: it names another SHA-256"
+
 
 def noack_check(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
     """Run noack-check; return its exit status and output."""
@@ -45,7 +47,8 @@ def test_noack_check_proves_the_bounds_that_certify_prints(
     assert "PROVED |angle| ≤ 0.23597" in output
     assert "|angle| ≤ 0.236 e^(−0.3t)" in printed
     assert (
-        "of the loop document 'unstable_pendulum: all plants of its uncertainty under its schedule'" in output
+        "for each run of the loop document 'unstable_pendulum: all plants of its uncertainty under its "
+        "schedule'" in output
     )
 
 
@@ -64,7 +67,16 @@ def test_noack_check_rejects_the_document_of_another_loop(
 ) -> None:
     (changed := tmp_path / "loop.json").write_text(files[0].read_text().replace("unstable", "stable"))
     status, output = noack_check(capsys, changed, files[1])
-    assert (status, output) == (1, "REJECTED the proof is one of another document, by its digest\n")
+    assert (status, output) == (1, f"REJECTED {OF_ANOTHER}\n")
+
+
+def test_noack_check_says_in_which_order_it_needs_the_files(
+    files: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in ((files[0],), (files[1],), (files[1], files[0])):
+        status, output = noack_check(capsys, *words)
+        assert (status, output[:8]) == (1, "REJECTED")
+        assert output.endswith("noack-check DOCUMENT PROOF\n")
 
 
 def test_files_that_cannot_be_read_are_named(
@@ -83,6 +95,9 @@ def test_files_that_cannot_be_read_are_named(
 def test_the_document_in_words_has_all_that_is_in_the_file(files: tuple[Path, Path]) -> None:
     words = invoke("check", "unstable_pendulum", "--document").output
     table = json.loads(files[0].read_text())
+    assert all(
+        f"- corner {k} as corner 1, but d/dt" in words for k in range(2, len(table["motions"]["driven"]) + 1)
+    )
     for key in ("coordinates", "locations", "edges", "outputs"):
         assert all(entry["name"] in words for entry in table[key])
     assert all(name in words for name in table["facts"])
@@ -98,7 +113,10 @@ def test_the_document_in_words_has_all_that_is_in_the_file(files: tuple[Path, Pa
             "there is no loop document: a rule with a dynamic variable",
         ),
         (("check", "lane_acknowledged", "--document"), "there is no proof: "),
-        (("check", "lane_5g_urban", "--document"), "there is no loop document: the bounds are by gains"),
+        (
+            ("check", "lane_5g_urban", "--document"),
+            "there is no loop document: the bounds are small-gain bounds",
+        ),
     ],
 )
 def test_what_has_no_document_is_said_in_one_line(words: tuple[str, ...], line: str) -> None:

@@ -24,12 +24,25 @@ def test_a_run_conforms(runs: Path) -> None:
     assert (result.exit_code, found["conforms"], found["reason"]) == (ExitStatus.OK, True, "")
     assert found["transitions"]["0 lost, silent"] > 100
     printed = " ".join(invoke("conform", "--runs", runs / "unstable_pendulum").output.split())
-    assert "the run is a run of its loop document; " in printed
+    assert (
+        "the run is a run of the loop document 'unstable_pendulum: the plant under its schedule', so"
+        in printed
+    )
 
 
 def test_the_document_may_be_that_of_all_plants(runs: Path) -> None:
     assert (
         invoke("conform", "--runs", runs / "unstable_pendulum", "--plants", "box").exit_code == ExitStatus.OK
+    )
+
+
+def test_the_document_of_a_plant_given_by_equations_needs_no_option(tmp_path: Path) -> None:
+    words = ("--no-report", "--set", "horizon_s=1", "--runs", tmp_path)
+    assert invoke("simulate", "friction_servo", *words).exit_code == ExitStatus.OK
+    found = json.loads(invoke("conform", "--runs", tmp_path, "--json").stdout)
+    assert (found["conforms"], found["document"]) == (
+        True,
+        "friction_servo: the plant's equations under its schedule",
     )
 
 
@@ -51,4 +64,4 @@ def test_a_run_that_another_loop_made_is_refuted(runs: Path) -> None:
 def test_a_run_without_a_document_is_refused_in_one_line(runs: Path) -> None:
     result = invoke("conform", "--runs", runs / "lane_acknowledged")
     assert result.exit_code == ExitStatus.CALLER
-    assert "there is no proof that the run could be compared with" in result.stderr
+    assert "nothing is proved of the loop, so there is no loop document to compare" in result.stderr
