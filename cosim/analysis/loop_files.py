@@ -26,14 +26,19 @@ def loop_files(resolved: Scenario, statement: WitnessedStatement) -> ProofFiles:
 
 
 def files_of_widest(resolved: Scenario, witnesses: Witnesses) -> ProofFiles:
-    """Return the files of the statement that covers most: under the schedule, of all plants if possible.
+    """Return the files of the statement that covers most: see :func:`widest`.
 
     Raises:
-        CallerError: as :func:`loop_files`, of the statement that covers most.
+        CallerError: as :func:`loop_files`.
     """
+    return loop_files(resolved, widest(witnesses))
+
+
+def widest(witnesses: Witnesses) -> WitnessedStatement:
+    """Return the statement with a loop document that covers most: all plants if possible, by the schedule."""
     statements = [s for s in witnesses.statements if s.conditions == "schedule"] or [*witnesses.statements]
     proven = [s for s in statements if s.document is not None and s.document.get("bounds")]
-    return loop_files(resolved, (proven or statements)[-1])
+    return (proven or statements)[-1]
 
 
 def naming_of(resolved: Scenario, statement: WitnessedStatement) -> Naming:

@@ -144,9 +144,18 @@ def test_the_wheel_contains_the_packages_and_their_data_only(dist: Path) -> None
         paths = (ROOT / folder).rglob("*")
         kept = {path for path in paths if path.suffix in (".toml", ".csv", ".md")}
         assert {f"cosim/{path.relative_to(ROOT)}" for path in kept} <= names
-    packages = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim", "noack_check")
+    packages = (
+        "noack",
+        "plant_server",
+        "sensor_node",
+        "controller_node",
+        "netem",
+        "cosim",
+        "noack_check",
+        "noack_kernel",
+    )
     for package in packages:
-        root = ROOT / "checker" if package == "noack_check" else ROOT
+        root = ROOT / "checker" if package in ("noack_check", "noack_kernel") else ROOT
         files = {
             str(path.relative_to(root))
             for path in (root / package).rglob("*")

@@ -4,8 +4,8 @@ from cosim.analysis.claims.common_end import up_to_common_end
 from cosim.analysis.claims.reference_deviations import deviations
 from cosim.analysis.conformance.conformance import Conformance, compare
 from cosim.analysis.conformance.trace import trace_of
-from cosim.analysis.loop_files import naming_of
-from cosim.analysis.witnesses import WitnessedStatement, find_statement, plants_of
+from cosim.analysis.loop_files import naming_of, widest
+from cosim.analysis.witnesses import WitnessedStatement, find_witnesses, plants_of
 from cosim.record.run_record import RunRecord
 from noack.core.errors import CallerError
 from noack.proof.files import document_of
@@ -18,7 +18,8 @@ def conformance_of(record: RunRecord, plants: str | None = None) -> Conformance:
 
     Args:
         record: of the loop; of a stopped run, it is compared up to its common end.
-        plants: "own", "box" or "region"; by default the plant itself.
+        plants: "own", "box" or "region"; by default those of the document that ``noack certify`` writes: all
+            plants within the uncertainty, if they have one.
 
     Raises:
         CallerError: no document describes the loop, or it cannot be compared yet; the message says why.
@@ -26,8 +27,10 @@ def conformance_of(record: RunRecord, plants: str | None = None) -> Conformance:
     scenario = record.scenario
     if (known := plants_of(scenario)) == ["region"] and plants not in (None, "region"):
         raise CallerError("--plants: a plant given by equations has one document; leave the option out")
-    statement = find_statement(scenario, plants or known[0], "schedule", most_work=0.0)
-    return conformance_with(record, statement)
+    of = known if plants is None else [plants]
+    return conformance_with(
+        record, widest(find_witnesses(scenario, most_work=0.0, conditions=("schedule",), plants=of))
+    )
 
 
 def conformance_with(record: RunRecord, statement: WitnessedStatement) -> Conformance:

@@ -177,8 +177,8 @@ def conform(
     plants: Annotated[
         Plants | None,
         Option(
-            help="Which document: that of the plant itself (own, the default for a linear plant), or that of "
-            "all plants within its uncertainty (box), which noack certify --document writes."
+            help="Which document: that of the plant itself (own), or that of all plants within its "
+            "uncertainty (box); by default the one that noack certify --document writes."
         ),
     ] = None,
     json: opt.JsonOption = False,
