@@ -4,11 +4,12 @@ The search takes some seconds to minutes; what it finds is verified by :mod:`noa
 the loop from the resolved scenario itself.
 """
 
+import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from flint import fmpq
@@ -45,6 +46,9 @@ from noack_check.scenario import Enclosed as EnclosedPlant
 from noack_check.scenario import read_loop
 from noack_kernel import RejectedError as RejectedByKernelError
 
+_T = TypeVar("_T")
+_MOST_KEPT = 300
+"""Results of one kind that are kept in a process."""
 _NEAR = 1e-3
 """The equations near 0, in multiples of typical sizes: they tell searches for other plants apart."""
 
@@ -209,12 +213,8 @@ def find_statement(
     except (RefusedError, NoWitnessError, NotEnclosedError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
-    try:
-        proof_files(loop, document, Naming(resolved.name)).verify()
-    except NoDocumentError:  # bounds by gains, which only the checker verifies
-        pass
-    except RejectedByKernelError as error:
-        return WitnessedStatement(plants, conditions, None, None, f"the kernel rejects the proof: {error}")
+    if why := _rejected_by_kernel(loop, witness.document):
+        return WitnessedStatement(plants, conditions, None, None, f"the kernel rejects the proof: {why}")
     return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds, loop)
 
 
@@ -338,8 +338,11 @@ def _known_or_found(
     if known is not None and known.document is None:
         raise NoWitnessError(known.reason)
     if known is not None and known.document is not None:
+        key = store.name, _digest(known.document)
         with suppress(RejectedError, NotEnclosedError):  # it was changed
-            return Witness(known.document, proven(known.document))
+            if key not in _proofs:
+                _keep(_proofs, key, proven(known.document))
+            return Witness(known.document, _proofs[key])
     if not most_work:
         return _by_gains(store, wanted, search)
     try:
@@ -351,9 +354,39 @@ def _known_or_found(
     return witness
 
 
+_proofs = dict[tuple[str, str], Proof]()
+"""What the checker has proven in this process, by loop and document: loops with equal numbers share it."""
+_of_kernel = dict[tuple[str, str], str]()
+"""Why the kernel has rejected a proof in this process, or an empty text."""
+
+
+def _rejected_by_kernel(loop: Loop, document: Mapping[str, object]) -> str:
+    """Return why the kernel rejects the proof of a loop's bounds by forms; empty if it accepts the proof."""
+    key = WitnessStore(loop).name, _digest(document)
+    if key not in _of_kernel:
+        why = ""
+        try:
+            proof_files(loop, document, Naming("loop")).verify()
+        except NoDocumentError:  # bounds by gains, which only the checker verifies
+            pass
+        except RejectedByKernelError as error:
+            why = str(error)
+        _keep(_of_kernel, key, why)
+    return _of_kernel[key]
+
+
+def _digest(document: Mapping[str, object]) -> str:
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+
+
+def _keep(known: dict[tuple[str, str], _T], key: tuple[str, str], value: _T) -> None:
+    if len(known) >= _MOST_KEPT:
+        known.clear()
+    known[key] = value
+
+
 _found_by_gains = dict[tuple[str, tuple[str, ...]], Witness | str]()
 """What was found without a search in this process, or why nothing was."""
-_MOST_KEPT = 300
 
 
 def _by_gains(store: WitnessStore, wanted: tuple[str, ...], search: Callable[[], Witness]) -> Witness:

@@ -34,7 +34,7 @@ def test_one_of_each_command_runs(
 def test_the_way_of_the_readme_leads_from_a_plant_to_a_live_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its three commands, in their order; the first line of two of them is the sentence that it shows."""
+    """Its three commands, in their order: two begin with its first sentence, the third with the second."""
     monkeypatch.chdir(tmp_path)
     (code,) = blocks("README.md", "python")
     assert blocks("docs/tutorial.md", "python") == [code]  # it goes the same way
@@ -46,10 +46,13 @@ def test_the_way_of_the_readme_leads_from_a_plant_to_a_live_loop(
         more = ["--no-report", "--set=speed=4"] if words[0] == "run" else []
         finished = invoke(*words, *more)
         assert finished.exit_code == 0, finished.output
+        printed, (guaranteed, happened) = " ".join(finished.stdout.split()), shown.splitlines()
         if words[0] != "run":
-            assert alike(" ".join(finished.stdout.split())[: len(shown)].strip(), shown.strip())
+            assert alike(printed[: len(guaranteed)], guaranteed)
         else:
-            assert finished.stdout.startswith("angle was within 0.02 rad of its set-point")
+            assert printed.startswith(
+                happened.partition(" from ")[0]
+            )  # when it settles depends on the losses
 
 
 @pytest.mark.system
