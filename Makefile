@@ -121,10 +121,10 @@ define LEVEL
 	exit $$failed
 endef
 
-test: setup-dev ## Run the tests: 9 minutes on two processors (ARGS are pytest's, e.g. ARGS="-k mansd")
+test: setup-dev ## Run the tests: 6 minutes on two processors (ARGS are pytest's, e.g. ARGS="-k mansd")
 	$(if $(ARGS),$(PYTEST) -m "not system and not deep" $(ARGS),$(call LEVEL,not system and not deep))
 
-test-system: setup-dev ## Test what needs a browser, root or another build, and what the documentation shows: 5 minutes
+test-system: setup-dev ## Test what needs a browser, root or another build, and what the documentation shows: 4 minutes
 	$(if $(ARGS),$(PYTEST) -m system $(ARGS),$(call LEVEL,system and not deep))
 
 test-deep: setup-dev ## Masses of random inputs, long searches, an hour of fuzz and one of soak; MINUTES=5 for less
