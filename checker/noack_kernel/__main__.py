@@ -42,6 +42,8 @@ def verify(document: Path, proof: Path) -> int:
             print(printable(f"PROVED {statement}"))
         print(printable(f"       for each run of the loop document {loop.name!r}"))
         print(f"       with the SHA-256 {loop.digest}")
+        for fact, words in loop.words.items():
+            print(printable(f"       in which a fact is {fact!r}: {words}"))
         count = sum(statement.inequalities for statement in statements)
         print(f"       by {count} inequalities, which {lines_of_kernel()} lines of Python verified")
         sys.stdout.flush()

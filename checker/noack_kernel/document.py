@@ -144,6 +144,7 @@ class Document:
         self.units = [i for i in (self.decaying, self.constant) if i is not None]
         self.states = [i for i in range(self.size) if i not in self.noise]
         self.rows = {name: self._rows(rows, name) for name, rows in mapping(table["rows"], "rows").items()}
+        self.words: dict[str, str] = {}
         self.facts = {name: self._fact(name, f) for name, f in mapping(table["facts"], "facts").items()}
         motions = mapping(table["motions"], "motions")
         self.motions = {name: self._motion(name, corners) for name, corners in motions.items()}
@@ -210,7 +211,7 @@ class Document:
         """Return Q of a fact zᵀQz ≤ 0."""
         entry, total = mapping(value, name), zeros(self.size, self.size)
         fields(entry, f"fact {name}", {"less", "more", "words"})
-        text_of(entry["words"], name)
+        self.words[name] = text_of(entry["words"], name)
         for side, sign in (("less", 1), ("more", -1)):
             for rows in _known(entry[side], self.rows, f"fact {name}"):
                 total += square(self.rows[rows]).times(fmpq(sign))

@@ -45,6 +45,7 @@ def test_noack_check_proves_the_bounds_that_certify_prints(
     assert status == ExitStatus.OK
     printed = " ".join(invoke("certify", "unstable_pendulum", "--no-search").output.split())
     assert "PROVED |angle| ≤ 0.23597" in output
+    assert "in which a fact is 'silent': no event: the comparison is at most the threshold" in output
     assert "|angle| ≤ 0.236 e^(−0.3t)" in printed
     assert (
         "for each run of the loop document 'unstable_pendulum: all plants of its uncertainty under its "
