@@ -216,9 +216,15 @@ class LoopDocument:
         sizes: list[str] = [name for name in ("share", "level", "floor") if name in self.rows]
         if "compared" in self.rows:
             words = "no event: the comparison is at most the threshold"
-            self._add_fact("silent", ["compared"], sizes, words, model.silent)
+            self._add_fact("silent", ["compared"], [*sizes], words, model.silent)
+        if "" in model.guards and rule.floor > 0:  # the least threshold, where "floor" is the largest
+            least = [quotient(_lower(rule.floor)) if self.labels[c] == "f2" else 0 for c in self.used]
+            self.rows["least threshold"] = [least]
+            sizes.append("least threshold")
         for guard, Q in model.guards.items():
-            kept = {"c1": ["share", "level"], "c2": ["share", "floor"], "": ["share", "floor"]}[guard]
+            kept = {"c1": ["share", "level"], "c2": ["share", "floor"], "": ["share", "least threshold"]}[
+                guard
+            ]
             name = {"c1": "event, level", "c2": "event, floor", "": "event"}[guard]
             words = "an event: the comparison is at least the threshold"
             self._add_fact(name, [size for size in kept if size in sizes], ["compared"], words, Q)

@@ -3,10 +3,10 @@
 What has to be right for a statement about a run is this file, the kernel, and what the document says. A trace
 is a path: each item is a motion in a location, or an edge. For a run of the document
 
-* the path begins at the start, and each item begins where the one before has ended;
+* the path begins at the start and has each recorded step: motions lead to the next step, edges take no time;
 * an edge is taken while the clock is in its interval, where its facts hold, and z becomes J z;
 * in a location the clock does not exceed its limit, the facts hold, and z moves as the motion says;
-* x and u are those of the record.
+* x and u are the recorded x and u. The recorded x_s and x_c are not compared.
 
 Between two steps of the plant the input is constant. A motion whose corners have a common part,
 Fᵢ = F + B Uᵢ, moves as ż = F z + B u + Σ c p with u = Σ λᵢ Uᵢ z. So z at the end follows from z and u, but
@@ -75,8 +75,8 @@ class Conformance(NamedTuple):
         coverage = f"{taken} of the document's {len(self.edges)} kinds of transitions occurred"
         if self.conforms:
             return (
-                f"the run is a run of the loop document {self.document!r}, so the bounds that are proved of "
-                f"this document hold for the run; {coverage}"
+                f"the run is a run of the loop document {self.document!r}, so the bounds of states, outputs "
+                f"and inputs that are proved of this document hold for the run; {coverage}"
             )
         return (
             f"the run is a run of the loop document {self.document!r} until {self.until_s:.6g} s only: "
@@ -133,13 +133,19 @@ class _Checked:
     # The path.
 
     def path(self) -> None:
-        """Require that the path begins at the start, and that items follow each other."""
+        """Require that the path begins at the start, has all steps, and that items follow each other."""
         start, place = self._document["start"], self._document["start"]["location"]
         Z = _matrix(start["columns"])
         noise = self._z[0, self._noise]
         self._require_near(
             0, self._z[0, self._states], (Z @ np.append(1.0, noise))[self._states], "z at the start"
         )
+        steps = np.array(self._trace.steps)
+        self._require(
+            np.arange(len(steps) - 1), np.diff(steps) == self._is_motion, "the path does not go step by step"
+        )
+        if steps[0] != 0 or steps[-1] != len(self._trace.t_ns) - 1:
+            raise RefutedError(float(self._t_s[-1]), "the path does not have all steps of the record")
         for index, item in enumerate(self._trace.items):
             if item.is_motion:
                 if item.name != place or item.name not in self._locations:
@@ -308,7 +314,7 @@ class _Checked:
         steps = np.array(self._trace.steps)
         x = self._z[:, : self._trace.x.shape[1]]
         near = np.abs(x - self._trace.x[steps]) <= STATE * np.abs(self._trace.x[steps])
-        self._require(np.arange(len(steps) - 1), near.all(axis=1)[:-1], "x is not the recorded one")
+        self._require(np.arange(len(steps)), near.all(axis=1), "x is not the recorded one")
 
     def clock_shares(self) -> dict[str, float]:
         """Return the largest share of each clock's limit."""

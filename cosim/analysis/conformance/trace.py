@@ -89,7 +89,7 @@ class _Tracer:
         self._tests = {int(k): row for k, row in zip(place, range(len(tests)), strict=True)}
         events = tests["event"] != NO_SEQUENCE
         self._sent_step, self._sent_x = place[events], tests["x"][events]
-        self._x_s, self._measured, self._is_event = tests["x_s"], tests["x"], events
+        self._measured, self._is_event = tests["x"], events
         knows_start = record.scenario.network.initial_sync == "known_state"
         if knows_start:  # as if x(0) had been sent, and had arrived
             self._sent_step = np.append(0, self._sent_step)
@@ -107,7 +107,7 @@ class _Tracer:
                 document.model.locations[edge.source].name,
                 document.model.locations[edge.target].name,
                 _kind(name),
-            ): (name)
+            ): name
             for edge, name in document.edges
         }
         for index in document.silent_locations:
@@ -212,9 +212,7 @@ class _Tracer:
         event = now.events
         after = now._replace(events=event + 1)
         if place.startswith("start"):
-            if (
-                now.following >= event or now.following < 0
-            ):  # this one acts first, or none that was sent before
+            if now.following >= event or now.following < 0:  # no update that was sent before acts
                 return after, "start, 0 later", clock
             return after, f"start, {event - now.following} later", clock
         if now.following >= 0:
@@ -241,9 +239,8 @@ class _Tracer:
         acting = newest if state.acting < 0 else self._flow(state.step, state.acting)
         parts = [(model.x, x)]
         is_lost = state.following < 0 and state.acting >= 0
-        seen = floats(model.error_rows[0]).shape[0]
-        reduce = np.eye(len(x)) if model.sees_all else floats(document.loop.seen or document.loop.gain)
-        assert reduce.shape[0] == seen
+        seen = None if model.sees_all else document.loop.seen
+        reduce = np.eye(len(x)) if seen is None else floats(seen)
         smooth, decaying = self._smooth(state.step)
         parts.append((model.s, smooth))
         if model.is_periodic and is_lost:

@@ -159,6 +159,54 @@ def test_a_document_with_a_fault_is_refuted(traced: tuple[Trace, Table], change:
     assert re.search(REFUTED[change], found.reason), found.reason
 
 
+def leave_out_a_step(trace: Trace) -> None:
+    """One motion leads over two steps."""
+    at = next(i for i, item in enumerate(trace.items) if i > 100 and item.is_motion)
+    trace.items = trace.items[:at] + trace.items[at + 1 :]
+    trace.steps = trace.steps[:at] + trace.steps[at + 1 :]
+    trace.clocks_ns = trace.clocks_ns[:at] + trace.clocks_ns[at + 1 :]
+    trace.z = np.delete(trace.z, at, axis=0)
+
+
+def end_early(trace: Trace) -> None:
+    trace.items, trace.steps = trace.items[:101], trace.steps[:102]
+    trace.clocks_ns, trace.z = trace.clocks_ns[:102], trace.z[:102]
+
+
+def change_a_state(trace: Trace) -> None:
+    trace.z[500, 0] *= 1.0001
+
+
+def change_an_input(trace: Trace) -> None:
+    trace.u[200] *= 1.01
+
+
+WRONG: dict[Callable[[Trace], None], str] = {
+    leave_out_a_step: "step by step|after",
+    end_early: "all steps of the record",
+    change_a_state: "no motion of the document|z is another one|x is not the recorded one",
+    change_an_input: "no motion of the document|the input is none",
+}
+
+
+@pytest.mark.parametrize("change", WRONG, ids=lambda change: change.__name__)
+def test_a_wrong_trace_is_refuted(traced: tuple[Trace, Table], change: Callable[[Trace], None]) -> None:
+    trace = copy.deepcopy(traced[0])
+    trace.u, trace.x = trace.u.copy(), trace.x.copy()
+    change(trace)
+    found = compare(trace, traced[1])
+    assert not found.conforms
+    assert re.search(WRONG[change], found.reason), found.reason
+
+
+def test_a_run_of_a_loop_that_holds_its_updates_conforms() -> None:
+    """The document has the part of the error on which the input depends, and no more."""
+    scenario = resolved("double_integrator", "mode=zoh", "horizon_s=4")
+    statement = find_statement(scenario, "own", "schedule")
+    found = conformance_with(simulate(scenario), statement)
+    assert found.conforms, found.verdict
+
+
 def test_a_run_whose_plant_steps_late_is_refuted_where_an_input_is_for_a_later_time() -> None:
     record = late_run(lambda step: 4 if step % 40 == 0 else 0)
     with pytest.raises(CallerError, match="there is no"):
