@@ -199,11 +199,23 @@ def test_a_wrong_trace_is_refuted(traced: tuple[Trace, Table], change: Callable[
     assert re.search(WRONG[change], found.reason), found.reason
 
 
-def test_a_run_of_a_loop_that_holds_its_updates_conforms() -> None:
-    """The document has the part of the error on which the input depends, and no more."""
-    scenario = resolved("double_integrator", "mode=zoh", "horizon_s=4")
-    statement = find_statement(scenario, "own", "schedule")
-    found = conformance_with(simulate(scenario), statement)
+RULES = {
+    "held updates": "mode=zoh",
+    "absolute": "trigger={policy='absolute',delta=0.05}",
+    "relative": "trigger={policy='relative',sigma=0.05}",
+    "mixed": "trigger={policy='mixed',sigma=0.05,epsilon=0.02}",
+    "deadline": "trigger={policy='deadline',rule={policy='absolute',delta=0.05},interval_s=0.5}",
+    "periodic": "trigger={policy='periodic',period_s=0.02}",
+}
+
+
+@pytest.mark.parametrize(
+    "rule", [pytest.param(rule, marks=() if rule == "held updates" else pytest.mark.deep) for rule in RULES]
+)
+def test_runs_with_other_rules_conform(rule: str) -> None:
+    """The document has what the input depends on of the error, and the least threshold of an event."""
+    scenario = resolved("double_integrator", RULES[rule], "network.mansd=2", "horizon_s=4")
+    found = conformance_with(simulate(scenario), find_statement(scenario, "own", "schedule"))
     assert found.conforms, found.verdict
 
 
