@@ -313,8 +313,12 @@ class Model:
         Only with the guard of a unit does an edge leave room for a constant c of this unit that differs
         between locations. Where it is missing, all locations have the same c, and edges use no facts.
         """
+        return {} if self.loop.rule.always else self.exceeded()
+
+    def exceeded(self) -> Mapping[str, arb_mat]:
+        """Return by unit what is ≤ 0 where the rule's comparison exceeds the unit's threshold."""
         rule, found = self.loop.rule, {}
-        if not rule.always and rule.positive.nrows():
+        if rule.positive.nrows():
             if bool(self.rate == rule.rate) and rule.level > 0 and self._has_f1:
                 found["c1"] = -1 * self._comparison(rule.level, arb(0))
             if rule.floor > 0 and bool(self.floor == rule.floor):
@@ -873,8 +877,9 @@ class Model:
 
         "x" is x, "x[i]" one of its entries, "u[j]" one of the input, "y[j]" the j-th output, "e_s" and
         "e_c" are W e_s and W e_c, and
-        "drift" is W (ẋ − H x), by which the sensor's error grows: ė = He − (ẋ − Hx). The bound of the
-        drift is one from the first input on.
+        "drift" is W (ẋ − H x), by which the sensor's error grows: ė = He − (ẋ − Hx). With an error Ss of an
+        observer it is that of e − Ss: s is left out of it. The bound of the drift is one from the first
+        input on.
         """
         loop = self.loop
         if name == "x":
@@ -884,7 +889,13 @@ class Model:
         if name == "e_c":
             return [(loop.weight * (self.e + self.w), None)]
         if name == "drift":
-            return [(self._drift(flow.matrix) - loop.weight * loop.H * self.x, flow) for flow in place.flows]
+            known = loop.H * self.x
+            if self.s.nrows():
+                known += (
+                    loop.H * self.bounds.smooth.columns
+                    - self.bounds.smooth.columns * self.bounds.smooth.rates
+                ) * self.s
+            return [(self._drift(flow.matrix) - loop.weight * known, flow) for flow in place.flows]
         index = int(name[2:].removesuffix("]"))
         if name.startswith("u["):
             return [(rows_of(flow.input, [index]), None) for flow in place.flows]

@@ -313,7 +313,7 @@ def _times_between_events(
 def _prove_quiet_start(loop: Loop) -> None:
     """Prove that no event happens after the one at t = 0 until the first input acts."""
     times, rule = loop.times, loop.rule
-    last = times.start if not times.sampling > 0 else _last_test_before(times, times.start)
+    last = times.start if not times.sampling > 0 else last_test_before(times, times.start)
     if last == 0:
         return
     if (rule.always and not times.due > last) or not rule.positive.nrows():
@@ -384,7 +384,7 @@ def prove_first_event(loop: Loop, drift: Bound, first: arb, until: fmpq) -> None
         raise RejectedError("first_event_s: an event may come earlier")
 
 
-def _last_test_before(times: Times, until: fmpq) -> fmpq:
+def last_test_before(times: Times, until: fmpq) -> fmpq:
     """Return the time of the last test before a time; one at this time comes after it."""
     if times.least_sampling == 0:
         return until

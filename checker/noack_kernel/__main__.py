@@ -37,15 +37,15 @@ def verify(document: Path, proof: Path) -> int:
         print(printable(f"noack-check: {error}"), file=sys.stderr)
         return UNREADABLE
     try:
-        statements, loop = prove(*texts), Document(texts[0])
-        for statement in statements:
-            print(printable(f"PROVED {statement}"))
+        proven, loop = prove(*texts), Document(texts[0])
+        for sentence in proven.sentences:
+            print(printable(f"PROVED {sentence}"))
         print(printable(f"       for each run of the loop document {loop.name!r}"))
         print(f"       with the SHA-256 {loop.digest}")
         for fact, words in loop.words.items():
             print(printable(f"       in which a fact is {fact!r}: {words}"))
-        count = sum(statement.inequalities for statement in statements)
-        print(f"       by {count} inequalities, which {lines_of_kernel()} lines of Python verified")
+        lines = lines_of_kernel()
+        print(f"       by {proven.inequalities} inequalities, which {lines} lines of Python verified")
         sys.stdout.flush()
     except RejectedError as error:
         print(printable(f"REJECTED {error}"))

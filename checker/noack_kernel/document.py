@@ -88,6 +88,8 @@ class Edge:
     """What becomes of the clock: "zero", "keeps", or "any" value that the target allows."""
     facts: tuple[str, ...]
     jump: Matrix
+    event: bool
+    """Whether it counts as an event: a statement about the time between two events is about such edges."""
 
 
 @dataclass(frozen=True)
@@ -280,7 +282,10 @@ class Document:
     def _edge(self, entry: Table) -> Edge:
         name = name_of(entry.get("name"), "edges")
         place = f"edge {name}"
-        fields(entry, place, {"name", "from", "to", "clock", "facts"}, {"when", "jump"})
+        fields(entry, place, {"name", "from", "to", "clock", "facts"}, {"when", "jump", "event"})
+        event = entry.get("event", False)
+        if not isinstance(event, bool):
+            raise RejectedError(f"{place}: event is true or false")
         (source,) = _known([entry["from"]], self.locations, place)
         end = self.locations[source].clock
         first, last = fmpq(0), end
@@ -297,12 +302,11 @@ class Document:
         if entry["to"] is None:
             if "jump" in entry:
                 raise RejectedError(f"{place}: an edge that leads nowhere has no jump")
-            return Edge(
-                name, source, None, first, last, str(entry["clock"]), facts, zeros(self.size, self.size)
-            )
+            jump = zeros(self.size, self.size)
+            return Edge(name, source, None, first, last, str(entry["clock"]), facts, jump, event)
         (target,) = _known([entry["to"]], self.locations, place)
         jump = self._jump(place, entry.get("jump"), self.locations[source], self.locations[target])
-        return Edge(name, source, target, first, last, str(entry["clock"]), facts, jump)
+        return Edge(name, source, target, first, last, str(entry["clock"]), facts, jump, event)
 
     def _jump(self, place: str, rows: object, source: Location, target: Location) -> Matrix:
         J = read_matrix(rows, self.size, self.size)

@@ -1,4 +1,4 @@
-"""One bound: quadratic forms of each location, and the inequalities that prove it (rules R1 to R5).
+"""Quadratic forms of each location, and the inequalities that prove a bound or a lemma (rules R1 to R6).
 
 V(z, θ) = zᵀP(θ)z with P of the location and of the clock θ, affine between nodes. "M ⪰ 0" is tested by
 :func:`.exact.is_positive`. A fact q(z) = Σ|Rz|² − Σ|R'z|² is ≤ 0 where it holds, so m·q with a multiplier
@@ -6,9 +6,14 @@ m ≥ 0 may be added to what has to be ≥ 0; likewise τ(|p|² − |Rz|²) of a
 one at each moment. It has no part in P, and stays in every inequality.
 
 All inequalities are affine in the mixture of corners and, between nodes, in θ: corners and nodes suffice.
+
+R6: forms V₁, V₂, … that have R3 may use each other. If V̇ᵢ ≤ −νᵢ Vᵢ + Σ mᵢⱼ Vⱼ along motions, with j ≠ i and
+mᵢⱼ ≥ 0, and Vᵢ⁺ ≤ Σ mᵢⱼ Vⱼ at edges, with mᵢⱼ ≥ 0, then all Vᵢ stay ≤ 0, since they are so at the start: such
+a system of inequalities is cooperative. So Σ m V of other forms may be added to what has to be ≥ 0. In an
+inequality that is affine in θ, such a number m is one number on each piece of the clock.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from flint import fmpq
@@ -44,6 +49,8 @@ from noack_kernel.exact import (
 class Forms:
     """The forms and multipliers of one entry of a proof, which has to be verified.
 
+    An entry is the proof of a bound, or a lemma, whose forms others use.
+
     Args:
         document: what the loop is.
         entry: of the proof.
@@ -53,17 +60,16 @@ class Forms:
     """
 
     def __init__(self, document: Document, entry: Table) -> None:
-        fields(entry, "bound", {"output", "from", "decay", "levels", "matrices", "forms", "multipliers"})
+        of_kind = {"name"} if "name" in entry else {"output", "from", "levels"}
+        fields(entry, "bound", of_kind | {"decay", "matrices", "forms", "multipliers"})
         self._document = document
-        self.name = name_of(entry["output"], "output")
-        if self.name not in document.outputs:
-            raise RejectedError(f"the document has no output {self.name[:40]!r}")
-        self.output = document.outputs[self.name]
-        if entry["from"] not in ("start", "limit"):
-            raise RejectedError(f"{self.name}: a bound is from the start on, or in the limit")
-        self.starts = entry["from"] == "start"
+        self.output: Output | None = None
+        self.starts, self.levels = True, (fmpq(0), fmpq(0))
+        if "name" in entry:
+            self.name = name_of(entry["name"], "lemma")
+        else:
+            self._read_bound(entry)
         self.decay = rational(entry["decay"])
-        self.levels = self._read_levels(entry["levels"])
         self._matrices = {
             n: _symmetric(n, rows) for n, rows in mapping(entry["matrices"], "matrices").items()
         }
@@ -75,17 +81,19 @@ class Forms:
         for location in document.locations.values():
             self._read_form(location, mapping(table[location.name], "forms"))
         self._used: set[str] = set()
+        self._others: Mapping[str, Forms] = {}
+        self.never: set[str] = set()
+        """Edges with ``to: null`` that :meth:`verify` has proven to be never taken."""
 
-    def _read_levels(self, value: object) -> tuple[fmpq, fmpq]:
-        """Return D1² and D2²; one of a unit that the document lacks is 0."""
-        if not isinstance(value, list) or len(value) != 2:
-            raise RejectedError(f"{self.name}: levels are two numbers")
-        levels = rational(value[0]), rational(value[1])
-        units = self._document.decaying, self._document.constant
-        for level, unit in zip(levels, units, strict=True):
-            if level < 0 or (level > 0 and unit is None):
-                raise RejectedError(f"{self.name}: a level below 0, or of a unit that the document lacks")
-        return levels
+    def _read_bound(self, entry: Table) -> None:
+        self.name = name_of(entry["output"], "output")
+        if self.name not in self._document.outputs:
+            raise RejectedError(f"the document has no output {self.name[:40]!r}")
+        self.output = self._document.outputs[self.name]
+        if entry["from"] not in ("start", "limit"):
+            raise RejectedError(f"{self.name}: a bound is from the start on, or in the limit")
+        self.starts = entry["from"] == "start"
+        self.levels = read_levels(self._document, self.name, entry["levels"])
 
     def _read_form(self, location: Location, table: Table) -> None:
         name = location.name
@@ -128,12 +136,16 @@ class Forms:
 
     # The rules.
 
-    def verify(self) -> int:
+    def verify(self, others: Mapping[str, "Forms"]) -> int:
         """Verify all inequalities, and return how many.
+
+        Args:
+            others: forms that may be used, by their names: those that have R3 and are verified, too.
 
         Raises:
             RejectedError: the first that is not proven, or multipliers that belong to none.
         """
+        self._others = others
         count = 0
         for name, M in self._inequalities():
             if not is_positive(M):
@@ -150,11 +162,15 @@ class Forms:
             for corner in location.motion:
                 yield from self._of_motion(location, corner)
         for edge in self._document.edges:
-            yield from self._of_edge(edge) if edge.target is not None else self._of_dead_edge(edge)
+            if edge.target is not None:
+                yield from self._of_edge(edge)
+            elif any(self._above(edge, node) for node in self._times(edge)):
+                yield from self._of_dead_edge(edge)
         if self.starts:
             yield self._of_start()
-        for name in self.output.locations:
-            yield from self._of_output(self.output, self._document.locations[name])
+        if self.output is not None:
+            for name in self.output.locations:
+                yield from self._of_output(self.output, self._document.locations[name])
 
     def _of_motion(self, location: Location, corner: Corner) -> Iterator[tuple[str, Matrix]]:
         """R1: −(2 zᵀPż + zᵀP'z + ν zᵀPz) + Σ m q + Σ τ(|p|² − |Rz|²) ⪰ 0: then e^{νt} V does not increase."""
@@ -164,51 +180,47 @@ class Forms:
             slope = zeros(self._document.size, self._document.size)
             if len(nodes) > 1:
                 slope = (forms[piece + 1] - forms[piece]).times(1 / (nodes[piece + 1] - nodes[piece]))
+            place = f"motion/{location.name}"
+            table = self._table(f"{place}/piece {piece}", {"forms", "decay"})
+            decay = rational(table["decay"]) if "decay" in table else self.decay
+            if not self.starts and decay != self.decay:
+                raise RejectedError(f"{place}: in the limit the decay is one number")
+            if self.name in mapping(table.get("forms", {}), place):
+                raise RejectedError(f"{place}: the form's own number is its decay")
             for end in (piece, piece + 1) if len(nodes) > 1 else (0,):
-                name = f"motion/{location.name}/{end}"
+                name = f"{place}/{end}"
                 P = forms[end]
-                M = product(P @ z, corner.velocity) + padded(slope + P.times(self.decay), signals)
-                M = self._with_facts(name, M.times(fmpq(-1)), location.facts, z, corner)
+                M = product(P @ z, corner.velocity) + padded(slope + P.times(decay), signals)
+                M = M.times(fmpq(-1)) + padded(self._forms(table, location, end, fmpq(0)), signals)
+                M = self._with_facts(name, M, location.facts, z, corner)
                 yield name, self._within(location, M)
 
     def _of_edge(self, edge: Edge) -> Iterator[tuple[str, Matrix]]:
         """R2: zᵀP_s z − (Jz)ᵀP_t(Jz) + Σ m q ⪰ 0: then V does not increase."""
-        facts, z = self._facts_at(edge), self._variables(0)
+        facts, z = facts_at(self._document, edge), self._variables(0)
+        source = self._document.locations[edge.source]
         for node, other in self._pairs(edge):
             name = f"edge/{edge.name}/{node} {other}"
             after = edge.jump.T @ self.P[str(edge.target)][other] @ edge.jump
-            M = self._with_facts(name, self.P[edge.source][node] - after, facts, z, None)
-            yield name, self._within(self._document.locations[edge.source], M)
+            for before in self._before(f"edge/{edge.name}", source, self._times(edge), node):
+                yield name, self._within(source, self._with_facts(name, before - after, facts, z, None))
 
     def _of_dead_edge(self, edge: Edge) -> Iterator[tuple[str, Matrix]]:
         """R5: zᵀPz + Σ m q − ε (f1² or f2²) ⪰ 0 with ε > 0: where V ≤ 0 the edge is never taken."""
         if not self.starts:
-            raise RejectedError(
-                f"{self.name}: in the limit nothing excludes {edge.name}, which leads nowhere"
-            )
-        facts, z = self._facts_at(edge), self._variables(0)
+            raise RejectedError(f"{self.name}: in the limit nothing excludes {edge.name}")
+        facts, z = facts_at(self._document, edge), self._variables(0)
+        source = self._document.locations[edge.source]
         for node in self._times(edge):
             name = f"edge/{edge.name}/{node}"
-            M = self._with_facts(name, self.P[edge.source][node], facts, z, None)
-            above = mapping(mapping(self._multipliers.get(name, {}), name).get("above", {}), name)
-            if not above or any(rational(value) <= 0 for value in above.values()):
-                raise RejectedError(
-                    f"{self.name}: {edge.name} leads nowhere, and is not proven to be never taken"
-                )
-            for unit, value in above.items():
-                if unit not in [self._document.coordinates[i] for i in self._document.units]:
-                    raise RejectedError(f"{name}: {unit[:40]!r} is no unit")
-                row = unit_rows([self._document.coordinates.index(unit)], self._document.size)
-                M -= square(row).times(rational(value))
-            yield name, self._within(self._document.locations[edge.source], M)
+            above = read_above(self._document, name, self._above(edge, node))
+            for before in self._before(f"edge/{edge.name}", source, self._times(edge), node):
+                yield name, self._within(source, self._with_facts(name, before - above, facts, z, None))
+        self.never.add(edge.name)
 
-    def _facts_at(self, edge: Edge) -> list[str]:
-        """Return the facts of an edge, and those of its source without noise, which is another one here."""
-        document = self._document
-        every = range(document.size)
-        facts = document.locations[edge.source].facts
-        still = [fact for fact in facts if document.facts[fact].is_zero(document.noise, every)]
-        return [*dict.fromkeys([*edge.facts, *still])]
+    def _above(self, edge: Edge, node: int) -> Table:
+        name = f"edge/{edge.name}/{node}"
+        return mapping(mapping(self._multipliers.get(name, {}), name).get("above", {}), name)
 
     def _times(self, edge: Edge) -> range:
         """Return the nodes of the source that cover the times of the clock at which the edge may be taken."""
@@ -251,17 +263,50 @@ class Forms:
                 y = output.rows @ z
             if output.velocity is not None:
                 y += output.velocity @ corner.velocity
-            units = zeros(document.size, document.size)
-            for level, unit in zip(self.levels, (document.decaying, document.constant), strict=True):
-                if unit is not None:
-                    units += square(unit_rows([unit], document.size)).times(level)
-            for node, P in enumerate(self.P[location.name]):
+            units = of_units(document, self.levels)
+            times = range(len(self.nodes[location.name]))
+            for node in times:
                 name = f"output/{location.name}/{node}"
-                V = padded(P + units, z.width - z.height)
-                M = self._with_facts(name, V - square(y), location.facts, z, signals)
-                yield name, self._within(location, M)
+                for V in self._before(f"output/{location.name}", location, times, node):
+                    M = padded(V + units, z.width - z.height) - square(y)
+                    yield name, self._within(location, self._with_facts(name, M, location.facts, z, signals))
 
     # Parts of inequalities.
+
+    def _before(self, place: str, location: Location, times: range, node: int) -> Iterator[Matrix]:
+        """Yield the sum of forms at a node, for each piece of the clock at the node that has other numbers.
+
+        Without numbers it is the form itself.
+        """
+        pieces = [times.start]
+        if len(times) > 1:
+            pieces = [piece for piece in (node - 1, node) if piece in range(times.start, times.stop - 1)]
+        tables: list[Table] = []
+        for piece in pieces:
+            table = self._table(f"{place}/piece {piece}", {"forms"})
+            if table not in tables:
+                tables.append(table)
+                yield self._forms(table, location, node, fmpq(1))
+
+    def _forms(self, table: Table, location: Location, node: int, own: fmpq) -> Matrix:
+        """Return Σ m P of forms at a node of a location; ``own``: the default number of the form itself."""
+        numbers = {self.name: own, **mapping(table.get("forms", {}), location.name)}
+        total = zeros(self._document.size, self._document.size)
+        for name, value in numbers.items():
+            used = self if name == self.name else self._others.get(name)
+            if used is None:
+                raise RejectedError(f"{self.name}: no form {name[:40]!r} from the start on can be used")
+            if used.nodes[location.name] != self.nodes[location.name]:
+                raise RejectedError(f"{self.name}: the form {name} has other nodes in {location.name}")
+            total += used.P[location.name][node].times(multiplier(location.name, value))
+        return total
+
+    def _table(self, name: str, keys: set[str]) -> Table:
+        """Return the numbers of a piece of a clock."""
+        table = mapping(self._multipliers.get(name, {}), name)
+        fields(table, name, set(), keys)
+        self._used.add(name)
+        return table
 
     def _variables(self, signals: int) -> Matrix:
         """Return z as rows of (z, p), with as many unknown signals p."""
@@ -275,13 +320,7 @@ class Forms:
         table = mapping(self._multipliers.get(name, {}), name)
         self._used.add(name)
         fields(table, name, set(), {"facts", "unknown", "above"})
-        of_facts = mapping(table.get("facts", {}), name)
-        if unknown := sorted({*of_facts} - {*facts}):
-            raise RejectedError(f"{name}: the fact {unknown[0][:40]!r} does not hold here")
-        for fact, value in of_facts.items():
-            q = self._document.facts[fact]
-            q = z.T @ q @ z if name == "start" else padded(q, z.width - z.height)
-            M += q.times(_multiplier(name, value))
+        M += of_facts(self._document, name, table, facts, z)
         of_signals = table.get("unknown", [])
         if not isinstance(of_signals, list):
             raise RejectedError(f"{name}: multipliers of signals are no list")
@@ -314,7 +353,63 @@ def _symmetric(name: str, rows: object) -> Matrix:
     return M
 
 
-def _multiplier(name: str, value: object) -> fmpq:
+def read_levels(document: Document, name: str, value: object) -> tuple[fmpq, fmpq]:
+    """Return D1² and D2² of |y|² ≤ D1² f1² + D2² f2²; a number of a unit that the document lacks is 0."""
+    if not isinstance(value, list) or len(value) != 2:
+        raise RejectedError(f"{name}: levels are two numbers")
+    levels = rational(value[0]), rational(value[1])
+    for level, unit in zip(levels, (document.decaying, document.constant), strict=True):
+        if level < 0 or (level > 0 and unit is None):
+            raise RejectedError(f"{name}: a level below 0, or of a unit that the document lacks")
+    return levels
+
+
+def of_units(document: Document, levels: tuple[fmpq, fmpq]) -> Matrix:
+    """Return the matrix of D1² f1² + D2² f2²."""
+    total = zeros(document.size, document.size)
+    for level, unit in zip(levels, (document.decaying, document.constant), strict=True):
+        if unit is not None:
+            total += square(unit_rows([unit], document.size)).times(level)
+    return total
+
+
+def read_above(document: Document, name: str, value: Table) -> Matrix:
+    """Return the matrix of ε (f1² or f2²), or of a sum of both, with each ε > 0; there is at least one."""
+    if not value or any(rational(each) <= 0 for each in value.values()):
+        raise RejectedError(f"{name}: not proven to be never taken: nothing is above 0")
+    total = zeros(document.size, document.size)
+    for unit, each in value.items():
+        if unit not in [document.coordinates[i] for i in document.units]:
+            raise RejectedError(f"{name}: {unit[:40]!r} is no unit")
+        row = unit_rows([document.coordinates.index(unit)], document.size)
+        total += square(row).times(rational(each))
+    return total
+
+
+def facts_at(document: Document, edge: Edge) -> list[str]:
+    """Return the facts of an edge, and those of its source without noise, which is another one here."""
+    every = range(document.size)
+    facts = document.locations[edge.source].facts
+    still = [fact for fact in facts if document.facts[fact].is_zero(document.noise, every)]
+    return [*dict.fromkeys([*edge.facts, *still])]
+
+
+def of_facts(document: Document, name: str, table: Table, facts: Sequence[str], z: Matrix) -> Matrix:
+    """Return Σ m q(z) with the multipliers of a table, for facts that hold.
+
+    ``z``: rows of the variables of an inequality, (size, variables).
+    """
+    numbers = mapping(table.get("facts", {}), name)
+    if unknown := sorted({*numbers} - {*facts}):
+        raise RejectedError(f"{name}: the fact {unknown[0][:40]!r} does not hold here")
+    total = zeros(z.width, z.width)
+    for fact, value in numbers.items():
+        total += (z.T @ document.facts[fact] @ z).times(multiplier(name, value))
+    return total
+
+
+def multiplier(name: str, value: object) -> fmpq:
+    """Return a number of a proof that has to be ≥ 0."""
     found = rational(value)
     if found < 0:
         raise RejectedError(f"{name}: a multiplier below 0")
@@ -323,4 +418,4 @@ def _multiplier(name: str, value: object) -> fmpq:
 
 def _next(name: str, signals: list[object]) -> fmpq:
     """Take the next multiplier of a list; a missing one is 0."""
-    return _multiplier(name, signals.pop(0)) if signals else fmpq(0)
+    return multiplier(name, signals.pop(0)) if signals else fmpq(0)

@@ -1,14 +1,16 @@
 """What a proof proves of a document: its bounds, one after the other, and rule R7 (limits of a region)."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from pathlib import Path
+from typing import NamedTuple
 
 from flint import arb, fmpq
 
 from noack_kernel.document import Document, entries, fields, read_table
+from noack_kernel.event_times import EventTimes, ResetRows
 from noack_kernel.exact import RejectedError
 from noack_kernel.forms import Forms
 
@@ -65,7 +67,37 @@ class Statement:
         return f"|{name}| ≤ {' + '.join(parts)}{unit} {when}{where}"
 
 
-def prove(document: str, proof: str) -> list[Statement]:
+@dataclass(frozen=True)
+class LeastTime:
+    """Two events are at least ``apart`` s apart."""
+
+    apart: fmpq
+    outside: tuple[str, ...]
+    """Locations in which the loop may be at first, where nothing is proven."""
+
+    def __str__(self) -> str:
+        after = f", once the loop has left {', '.join(map(repr, self.outside))}" if self.outside else ""
+        return f"two events are at least {_rounded(self.apart, ROUND_FLOOR):g} s apart{after}"
+
+
+class Proven(NamedTuple):
+    """What a proof proves of a document."""
+
+    bounds: list[Statement]
+    least_times: list[LeastTime]
+    never: tuple[str, ...]
+    """Edges with ``to: null``; all of them are proven to be never taken."""
+    inequalities: int
+    """So many were verified."""
+
+    @property
+    def sentences(self) -> list[str]:
+        """The statements, a sentence each."""
+        edges = [f"the edge {name!r} is never taken" for name in self.never]
+        return [*map(str, self.bounds), *map(str, self.least_times), *edges]
+
+
+def prove(document: str, proof: str) -> Proven:
     """Return what a proof proves of a document; both are the contents of files.
 
     Raises:
@@ -73,33 +105,53 @@ def prove(document: str, proof: str) -> list[Statement]:
     """
     loop = Document(document)
     table = read_table(proof, FORMAT)
-    fields(table, "proof", {"format", "bounds"}, {"document"})
+    fields(table, "proof", {"format", "bounds"}, {"document", "lemmas", "times"})
     if "document" in table and table["document"] != loop.digest:
         raise RejectedError("the proof is one of another document: it names another SHA-256")
-    found = [_statement(loop, forms) for forms in _in_order(loop, table["bounds"])]
-    if not found:
-        raise RejectedError("the proof has no bound")
+    lemmas = [Forms(loop, entry) for entry in entries(table.get("lemmas", []), "lemmas")]
+    bounds = [Forms(loop, entry) for entry in entries(table["bounds"], "bounds")]
+    if not bounds or any(forms.output is None for forms in bounds):
+        raise RejectedError("the proof has no bound, or a lemma among the bounds")
+    if any(forms.output is not None for forms in lemmas):
+        raise RejectedError("the proof has a bound among the lemmas")
+    if len({(forms.name, forms.starts) for forms in (*lemmas, *bounds)}) < len(lemmas) + len(bounds):
+        raise RejectedError("two bounds or lemmas of one name and kind")
+    usable = {forms.name: forms for forms in (*lemmas, *bounds) if forms.starts}
+    count = sum(forms.verify(usable) for forms in lemmas)
+    found = [_statement(loop, forms, usable) for forms in bounds]
+    levels = {forms.name: forms.levels for forms in bounds if forms.starts}
+    times = [ResetRows(loop, entry, levels).verify() for entry in entries(table.get("times", []), "times")]
+    never = _require_dead(loop, [*lemmas, *bounds], times)
     _require_limits(loop, found)
-    return found
+    least = [
+        LeastTime(each.apart, tuple(name for name in loop.locations if name not in each.inside))
+        for each in times
+        if each.apart is not None
+    ]
+    count += sum(each.inequalities for each in found) + sum(each.inequalities for each in times)
+    return Proven(found, least, never, count)
 
 
-def _in_order(loop: Document, value: object) -> Iterator[Forms]:
-    """Yield the entries of a proof, one at a time, so that one is read when the one before is verified."""
-    seen = set()
-    for entry in entries(value, "bounds"):
-        forms = Forms(loop, entry)
-        if (forms.name, forms.starts) in seen:
-            raise RejectedError(f"{forms.name}: two bounds of one kind")
-        seen.add((forms.name, forms.starts))
-        yield forms
-
-
-def _statement(loop: Document, forms: Forms) -> Statement:
+def _statement(loop: Document, forms: Forms, usable: Mapping[str, Forms]) -> Statement:
     output = forms.output
+    assert output is not None
     everywhere = {*output.locations} == {*loop.locations}
     locations = None if everywhere else output.locations
-    count = forms.verify()
+    count = forms.verify(usable)
     return Statement(output.name, output.unit, forms.levels, loop.rate, forms.starts, locations, count)
+
+
+def _require_dead(loop: Document, forms: Sequence[Forms], times: Sequence[EventTimes]) -> tuple[str, ...]:
+    """Require that each edge that leads nowhere is proven to be never taken, by R5 or R10; return them.
+
+    Up to the first time at which one of them is taken all forms are ≤ 0 and all bounds hold, also at this
+    time, before the edge: so it is not taken.
+    """
+    proven = {name for each in forms for name in each.never} | {name for each in times for name in each.never}
+    dead = tuple(edge.name for edge in loop.edges if edge.target is None)
+    if missing := [name for name in dead if name not in proven]:
+        raise RejectedError(f"{missing[0]} leads nowhere, and is not proven to be never taken")
+    return dead
 
 
 def _require_limits(loop: Document, found: list[Statement]) -> None:

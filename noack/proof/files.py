@@ -7,8 +7,8 @@ from noack.proof.forms_proof import as_text, write_proof
 from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
 from noack_check.document import read_number
 from noack_check.loop import Loop
-from noack_check.proof import read_assumptions
-from noack_kernel import Statement, prove
+from noack_check.proof import compares_error, read_assumptions
+from noack_kernel import Proven, prove
 
 
 class ProofFiles(NamedTuple):
@@ -20,7 +20,7 @@ class ProofFiles(NamedTuple):
     proof: str
     """The contents of the files."""
 
-    def verify(self) -> list[Statement]:
+    def verify(self) -> Proven:
         """Return what the kernel proves; raise its RejectedError if it rejects the proof."""
         return prove(self.document, self.proof)
 
@@ -32,7 +32,7 @@ def proof_files(loop: Loop, statement: Mapping[str, object], naming: Naming) -> 
         NoDocumentError: it has no bounds by quadratic forms, or no document describes the loop.
     """
     document = document_of(loop, statement, naming)
-    proof = write_proof(document, _bounds(statement))
+    proof = write_proof(document, _bounds(statement), apart_of(loop, statement))
     return ProofFiles(document.table, as_text(document.table), as_text(proof))
 
 
@@ -51,3 +51,10 @@ def _bounds(statement: Mapping[str, object]) -> list[Any]:
             "noack certify NAME --witness FILE writes what proves them"
         )
     return bounds
+
+
+def apart_of(loop: Loop, statement: Mapping[str, object]) -> float:
+    """Return the time that two events are at least apart by the bound of the mismatch, in s; 0: unknown."""
+    if "inter_event_s" not in statement or not compares_error(loop) or loop.rule.always:
+        return 0.0
+    return float(read_number(statement, "inter_event_s"))

@@ -8,8 +8,10 @@ from typing import Any
 
 from flint import arb
 
-from noack.proof.loop_document import LoopDocument, Table
+from noack.proof.event_times import EventTimes, levels_of
+from noack.proof.loop_document import DRIFT, LoopDocument, Table
 from noack.proof.numbers import as_written, quotient, simplest
+from noack.proof.quiet_start import write_quiet_start
 from noack_check.model import Edge, Signal
 
 FORMAT = "noack-forms 1"
@@ -113,7 +115,7 @@ class _Bound:
             for node in range(len(place.nodes)):
                 key = f"m/{kind}/{place.name}/{node}"
                 table = self._facts(key, self._document.location_facts[index])
-                depends = kind == "flow" or self._found["output"] == "drift"
+                depends = kind == "flow" or self._found["output"] == DRIFT
                 if depends and (values := [*self._signals(key, signals, others)]) and any(values):
                     table["unknown"] = values
                 self._add(f"{name}/{place.name}/{node}", table)
@@ -158,11 +160,20 @@ class _Bound:
             self._multipliers[name] = table
 
 
-def write_proof(document: LoopDocument, bounds: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the proof of a document's bounds, from those that a search has found."""
+def write_proof(document: LoopDocument, bounds: Sequence[Mapping[str, Any]], apart_s: float = 0.0) -> Table:
+    """Return the proof of a document's bounds, from those that a search has found.
+
+    ``apart_s``: the time that two events are at least apart, as the search has found it; 0: none.
+    """
     digest = hashlib.sha256(as_text(document.table).encode()).hexdigest()
     found = [write_bound(document, bound) for bound in bounds]
-    return {"format": FORMAT, "document": digest, "bounds": found}
+    proof: Table = {"format": FORMAT, "document": digest, "bounds": found}
+    at_start = [edge for edge in document.dead_edges if edge["from"].startswith("start")]
+    if lemmas := [lemma for edge in at_start if (lemma := write_quiet_start(document, edge)) is not None]:
+        proof["lemmas"] = lemmas
+    if times := [*EventTimes(document, levels_of(bounds)).entries(apart_s)]:
+        proof["times"] = times
+    return proof
 
 
 def as_text(table: Table) -> str:

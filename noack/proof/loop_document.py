@@ -8,15 +8,30 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
+import numpy as np
 from flint import arb, arb_mat, fmpq
 
-from noack.proof.numbers import Number, entry, exact, least_above, matrix, quotient, to_fraction
+from noack.core.linear_systems import Matrix
+from noack.proof.numbers import (
+    Fractions,
+    Number,
+    as_written,
+    entry,
+    exact,
+    least_above,
+    matrix,
+    product,
+    quotient,
+    to_fraction,
+    written,
+)
 from noack_check.balls import columns_of, identity, is_zero, rows_of
 from noack_check.loop import Loop
 from noack_check.model import Edge, Flow, Location, Model, Unknown
-from noack_check.proof import Assumptions
+from noack_check.proof import Assumptions, compares_error, last_test_before
 
 FORMAT = "noack-hybrid 1"
 Table = dict[str, Any]
@@ -34,8 +49,11 @@ _EDGES = {
     "event": "an event while an update is on its way",
     "silent": "a test without an event",
     "all lost": "the update that was on its way acts, and all that were sent after it are lost",
+    "too early": "an event that is proven not to happen",
 }
 """What the ends of names of edges mean."""
+DRIFT = "drift"
+"""The output W(ẋ − Hx), as the search calls it."""
 
 
 class NoDocumentError(ValueError):
@@ -122,6 +140,7 @@ class LoopDocument:
         locations = [self._location(index) for index in range(len(self.model.locations))]
         self.edge_names = self._edge_names()
         edges = [self._edge(edge, name) for edge, name in self.edges]
+        self.dead_edges = [*self._dead_edges()]
         self.output_names = self._output_names([*dict.fromkeys(outputs)])
         self.outputs = [self._output(name) for name in self.output_names]
         self.table: Table = {
@@ -133,13 +152,13 @@ class LoopDocument:
             "facts": self.facts,
             "motions": self.motions,
             "locations": locations,
-            "edges": [*edges, *self._silent_edges()],
+            "edges": [*edges, *self._silent_edges(), *self.dead_edges],
             "start": self._start(),
             "outputs": self.outputs,
         }
-        if self._has("f1"):
+        if self.has("f1"):
             self.table["decaying"] = {"coordinate": "f1", "rate": exact(rate)}
-        if self._has("f2"):
+        if self.has("f2"):
             self.table["constant"] = "f2"
         if loop.region is not None:
             self.table["while"] = [*self._limits()]
@@ -170,7 +189,8 @@ class LoopDocument:
         entry = {"name": self.labels[index], "unit": self._units.get(index, "")}
         return entry | ({"noise": True} if is_noise else {})
 
-    def _has(self, unit: str) -> bool:
+    def has(self, unit: str) -> bool:
+        """Return whether the document has a unit, "f1" or "f2"."""
         return any(self.labels[index] == unit for index in self.used)
 
     def _about(self) -> str:
@@ -192,6 +212,7 @@ class LoopDocument:
             parts.append('"k later": an update is on its way, and k were sent after it')
         names = {kind for edge in model.edges for kind in _EDGES if edge.name.endswith(f", {kind}")}
         names |= {"silent"} if self.silent_locations else set()
+        names |= {"too early"} if self.dead_edges else set()
         parts += [f'"{kind}": {words}' for kind, words in _EDGES.items() if kind in names]
         return ". ".join(parts) + "."
 
@@ -208,20 +229,21 @@ class LoopDocument:
         if rule.negative.nrows():
             self.rows["share"] = self.columns(rule.negative * model.pair)
         for name, row in (("f1", model.f1), ("f2", model.f2)):
-            if self._has(name):
+            if self.has(name):
                 self.rows[name] = self.columns(row)
         for name, size, unit in (("level", model.level, "f1"), ("floor", model.floor, "f2")):
-            if size > 0 and self._has(unit):
+            if size > 0 and self.has(unit):
                 self.rows[name] = self._multiple(unit, size)
         sizes: list[str] = [name for name in ("share", "level", "floor") if name in self.rows]
         if "compared" in self.rows:
             words = "no event: the comparison is at most the threshold"
             self._add_fact("silent", ["compared"], [*sizes], words, model.silent)
-        if "" in model.guards and rule.floor > 0:  # the least threshold, where "floor" is the largest
+        guards = model.exceeded()
+        if "" in guards and rule.floor > 0:  # the least threshold, where "floor" is the largest
             least = [quotient(_lower(rule.floor)) if self.labels[c] == "f2" else 0 for c in self.used]
             self.rows["least threshold"] = [least]
             sizes.append("least threshold")
-        for guard, Q in model.guards.items():
+        for guard, Q in guards.items():
             kept = {"c1": ["share", "level"], "c2": ["share", "floor"], "": ["share", "least threshold"]}[
                 guard
             ]
@@ -268,7 +290,7 @@ class LoopDocument:
             limits = [
                 self._multiple(unit, factor * size)[0]
                 for unit, size in (("f1", errors.decaying), ("f2", errors.constant))
-                if self._has(unit)
+                if self.has(unit)
             ]
             self.rows[f"limit of {name}"] = limits
             words = "assumed here, and proven by induction over the events"
@@ -280,6 +302,19 @@ class LoopDocument:
     def _add_fact(self, name: str, less: list[str], more: list[str], words: str, Q: arb_mat) -> None:
         self.facts[name] = {"less": less, "more": more, "words": words}
         self._named.setdefault(_key(Q), name)
+
+    def threshold_squared(self, fact: str) -> float:
+        """Return c² of a fact that says that the comparison is at least a threshold c f1, or c f2."""
+        names = [name for name in self.facts[fact]["less"] if name != "share"]
+        return sum(float(Fraction(str(value))) ** 2 for name in names for value in self.rows[name][0])
+
+    def noise_columns(self) -> tuple[list[str], Matrix]:
+        """Return the names of noise coordinates, and WC of the noise Cp of a measurement, (n, names)."""
+        model = self.model
+        columns = self.loop.weight * columns_of(model.noise, [*model.sources])
+        shape = columns.nrows(), columns.ncols()
+        values = [float(value.mid()) for value in columns.entries()]
+        return [self.labels[c] for c in model.sources], np.array(values).reshape(shape)
 
     def fact(self, Q: arb_mat) -> str:
         """Return the name of a fact of the model."""
@@ -388,7 +423,41 @@ class LoopDocument:
         for row, c in enumerate(self.used):
             if c not in target.coordinates:  # also of noise, which does not follow from a jump
                 jump[row] = [0] * len(self.used)
+        if edge.is_test and ", silent" not in edge.name:
+            found["event"] = True
         return found | {"clock": self._clock_after(edge), "facts": self.facts_of(edge), "jump": jump}
+
+    def _dead_edges(self) -> Iterator[Table]:
+        """Yield the events of locations in which they are proven not to happen: they lead nowhere.
+
+        Such an event is no test's that comes as early as tests may come: the times of tests exclude others.
+        """
+        model, times = self.model, self.loop.times
+        if model.is_by_tests or model.is_periodic or self._assumed.later or not compares_error(self.loop):
+            return
+        ends = {"0 later": times.delay}
+        if not self._assumed.later_at_start:
+            ends["start, 0 later"] = times.start
+        for place in model.locations:
+            if place.name not in ends:
+                continue
+            last = last_test_before(times, ends[place.name])
+            is_due = self.loop.rule.always and times.due <= last
+            if last < times.least_apart or (last == 0 and times.sampling > 0) or is_due:
+                continue
+            yield {
+                "name": f"{place.name}, too early",
+                "from": place.name,
+                "to": None,
+                "when": [exact(times.least_apart), exact(last)],
+                "clock": "zero",
+                "facts": [*self._event_facts(), *(self.fact(Q) for Q in model.noise_bounds)],
+                "event": True,
+            }
+
+    def _event_facts(self) -> list[str]:
+        """Return the facts of an event by the rule's comparison."""
+        return [name for name in ("event, level", "event, floor", "event") if name in self.facts]
 
     def _silent_edges(self) -> Iterator[Table]:
         """Yield a test without an event for each location that has none: it sets the clock to 0."""
@@ -436,13 +505,27 @@ class LoopDocument:
         found: Table = {"name": label, "unit": self.naming.unit(name), "in": places}
         if name.startswith("u["):
             return found | {"input": int(name[2:-1])}
-        if name == "drift":
-            loop = self.loop
+        if name == DRIFT:
             where = [place for place in places if not place.startswith("start")]
-            rows = -1 * (loop.weight * loop.H * model.x)
-            velocity = self.columns(loop.weight * model.x)
-            return found | {"in": where, "rows": self.columns(rows), "velocity": velocity}
+            rows = product(self.error_matrix, self._error_rows)
+            velocity = [[-entry for entry in row] for row in self._error_rows]
+            return found | {"in": where, "rows": written(rows), "velocity": written(velocity)}
         return found | {"rows": self.columns(model.output(name, model.locations[0])[0][0])}
+
+    @cached_property
+    def error_matrix(self) -> Fractions:
+        """M = WHW⁻¹ to within rounding: d(We)/dt = M We − W(ẋ − Hx), without errors of an observer."""
+        loop = self.loop
+        M = loop.H if loop.weight == identity(loop.n) else loop.weight * loop.H * loop.weight.inv()
+        return [[as_written(float(M[i, j].mid())) for j in range(loop.n)] for i in range(loop.n)]
+
+    @cached_property
+    def _error_rows(self) -> Fractions:
+        """The rows We, as decimals of the document."""
+        rows = self.loop.weight * self.model.error_rows[0] * self._select
+        return [
+            [as_written(float(rows[i, j].mid())) for j in range(rows.ncols())] for i in range(rows.nrows())
+        ]
 
     def _limits(self) -> Iterator[Table]:
         """Yield the limits of a region; each is one of an output that is bounded."""

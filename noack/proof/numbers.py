@@ -7,6 +7,8 @@ from flint import arb, arb_mat, fmpq
 
 _MOST_DENOMINATOR = 10**12
 Number = int | float | str
+Fractions = list[list[Fraction]]
+"""The rows of an exact matrix."""
 
 
 def exact(value: arb | fmpq | float | int) -> Number:
@@ -95,3 +97,17 @@ def quotient(value: Fraction) -> Number:
 def matrix(M: arb_mat) -> list[list[Number | list[float]]]:
     """Return a matrix."""
     return [[entry(M[i, j]) for j in range(M.ncols())] for i in range(M.nrows())]
+
+
+def product(left: Fractions, right: Fractions) -> Fractions:
+    """Return the product of two exact matrices."""
+    columns = [*zip(*right, strict=True)]
+    return [
+        [sum((a * b for a, b in zip(row, column, strict=True)), Fraction()) for column in columns]
+        for row in left
+    ]
+
+
+def written(rows: Fractions) -> list[list[Number]]:
+    """Return an exact matrix as a file has it."""
+    return [[quotient(entry) for entry in row] for row in rows]

@@ -119,15 +119,18 @@ def _edge(edge: Table, names: Sequence[str], inside: Sequence[str]) -> Iterator[
         is_changed = [_value(v) for v in row] != [int(i == j) for j in range(len(names))]
         if is_changed and (names[i] in inside or any(map(_value, row))):
             changes.append(f"{names[i]} := {_row(row, names)}")
-    parts = [f"from {edge['from']!r} to {'nowhere: never taken' if edge['to'] is None else repr(edge['to'])}"]
+    target = "nowhere: proven to be never taken" if edge["to"] is None else repr(edge["to"])
+    parts = [f"from {edge['from']!r} to {target}"]
     if edge.get("when") is not None:
         first, last = edge["when"]
         when = _time(last) if _value(first) == _value(last) else f"{_time(first)} to {_time(last)}"
         parts.append(f"when the clock shows {when}")
-    parts.append(_CLOCKS[edge["clock"]])
+    if edge["to"] is not None:
+        parts.append(_CLOCKS[edge["clock"]])
     if edge["facts"]:
         parts.append(f"if {_quoted(edge['facts'])}")
-    parts.append(", ".join(changes) if changes else "nothing changes")
+    if edge["to"] is not None:
+        parts.append(", ".join(changes) if changes else "nothing changes")
     yield from _wrapped(f"- {edge['name']!r}: ", parts, "; ")
 
 

@@ -12,6 +12,7 @@ from flint import fmpq
 from cosim.analysis.certificates import Certificates
 from cosim.analysis.witnesses import resolved_content
 from noack.core.progress import no_progress
+from noack.proof.semidefinite import Accuracy
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.witnesses import semidefinite
@@ -22,7 +23,6 @@ from noack.theory.witnesses.effort import Effort, NoWitnessError, TooLargeError,
 from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.problem_size import problem_sizes, require_small
 from noack.theory.witnesses.search import Search
-from noack.theory.witnesses.semidefinite import Accuracy
 from noack.theory.witnesses.templates import Templates
 from noack_check.balls import identity, matrix, number
 from noack_check.loop import Loop

@@ -96,7 +96,7 @@ def compare(trace: Trace, document: Table) -> Conformance:
             failures.append(refuted)
     first = min(failures, key=lambda failure: failure.t_s, default=None)
     until_s = float(trace.t_ns[-1]) / NS_PER_S if first is None else first.t_s
-    names = [edge["name"] for edge in document["edges"]]
+    names = [edge["name"] for edge in document["edges"] if edge["to"] is not None]
     taken = Counter(item.name for item in trace.items if not item.is_motion)
     counts = {name: taken[name] for name in names}
     reason = "" if first is None else first.what

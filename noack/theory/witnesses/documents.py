@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.progress import Progress, no_progress
+from noack.proof.semidefinite import Accuracy
 from noack.theory.witnesses.assumptions import (
     first_assumptions,
     first_event_s,
@@ -23,7 +24,6 @@ from noack.theory.witnesses.gains import find_by_gains, find_gains
 from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.problem_size import require_small, work_of_loop
 from noack.theory.witnesses.search import FREE, Found, Search, refined
-from noack.theory.witnesses.semidefinite import Accuracy
 from noack.theory.witnesses.templates import Templates
 from noack_check.balls import number
 from noack_check.check import RejectedError

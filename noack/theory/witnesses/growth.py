@@ -16,11 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Stack, Vector, balancing_exponents
+from noack.proof.semidefinite import Accuracy, MatrixInequality, minimise
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError
 from noack.theory.witnesses.outward import above, below
-from noack.theory.witnesses.semidefinite import Accuracy, MatrixInequality, minimise
 from noack_check.check import RejectedError
 from noack_check.growth import Burst, Growth, PeriodicLoop, prove_growth, remembering
 

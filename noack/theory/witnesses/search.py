@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix
+from noack.proof.semidefinite import Accuracy, MatrixInequality, SolverAnswer, minimise
 from noack.theory.witnesses.coordinates import MEMORY, Frames, floats
-from noack.theory.witnesses.semidefinite import Accuracy, MatrixInequality, SolverAnswer, minimise
 from noack.theory.witnesses.templates import Template, Templates
 
 _CONSTANT_WEIGHT = 100.0
