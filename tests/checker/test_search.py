@@ -12,10 +12,10 @@ from flint import fmpq
 from cosim.analysis.certificates import Certificates
 from cosim.analysis.witnesses import resolved_content
 from noack.core.progress import no_progress
+from noack.proof import semidefinite
 from noack.proof.semidefinite import Accuracy
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
-from noack.theory.witnesses import semidefinite
 from noack.theory.witnesses.assumptions import first_assumptions, without_drift
 from noack.theory.witnesses.coordinates import floats, simulated_frames
 from noack.theory.witnesses.documents import _by_forms, _Rates, _Wanted, find_witness, rough_bounds
