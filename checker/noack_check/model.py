@@ -269,7 +269,7 @@ class Model:
         self.bounds = noise = noise or loop.plain_noise
         smooth = range(n + (2 + copies) * q, n + (2 + copies) * q + noise.smooth.rates.nrows())
         self.sources = range(smooth.stop, smooth.stop + noise.columns.ncols())
-        memories = range(self.sources.stop, self.sources.stop + (self.memory is not None))
+        memories = range(self.sources.stop, self.sources.stop + 2 * (self.memory is not None))
         self.size = memories.stop + 2
         every = identity(self.size)
         self.x = rows_of(every, range(n))
@@ -280,7 +280,7 @@ class Model:
         self.s, self.p = rows_of(every, smooth), rows_of(every, self.sources)
         self.moving = rows_of(self.x, range(n - loop.loads))
         self._decaying = noise.smooth.columns * self.s if smooth else 0 * self.x
-        self.y = rows_of(every, memories)
+        self.y, self.next_y = rows_of(every, memories[:1]), rows_of(every, memories[1:])
         self.e = self._error + self._decaying if smooth else self._error
         self.f1, self.f2 = (rows_of(every, [self.size - 2 + i]) for i in range(2))
         self.noise = 1 * self._decaying
@@ -423,7 +423,7 @@ class Model:
         q, s = self._seen.nrows(), self.sources.start - self.s.nrows()
         w, v = range(n + q, n + 2 * q) if has_w else range(0), range(n + 2 * q, n + (2 + copies) * q)
         known = (*range(n - self.loop.loads), *range(n, n + q), *w, *v, *range(s, self.sources.start))
-        return (*known, *range(self.sources.stop, first), *units)
+        return (*known, *range(self.sources.stop, first)[:1], *units)
 
     @property
     def is_guarded(self) -> bool:
@@ -490,7 +490,7 @@ class Model:
             if self.s.nrows():
                 smooth = self.bounds.smooth.rates * self.s
                 error -= self.bounds.smooth.columns * smooth
-            units = 0 * self.p, 0 * self.y, -self.rate * self.f1, 0 * self.f2
+            units = 0 * self.p, 0 * self.y, 0 * self.next_y, -self.rate * self.f1, 0 * self.f2
             moved = [self._reduced(each) for each in (error, H * self.w, *copies)]
             matrix = stack([velocity, *moved, smooth, *units])
             found.append(Flow(matrix, (*(signal.scaled for signal in self.signals(u)), *further), u))
@@ -584,7 +584,7 @@ class Model:
         rest = [0 * self.w] * (len(self.v) - len(v))
         error = e - self._decaying if self.s.nrows() else e
         errors = [self._reduced(each) for each in (error, w, *v, *rest)]
-        return stack([self.x, *errors, self.s, self.p, self.y, self.f1, self.f2])
+        return stack([self.x, *errors, self.s, self.p, self.y, self.next_y, self.f1, self.f2])
 
     # Tests at exact times.
 
@@ -998,13 +998,20 @@ class Model:
         at_start = rows_of(z, self.locations[index].coordinates)
         terms = _Terms(z.ncols())
         terms.add(self.form(index, 0), at_start, at_start, arb(-1) / 2)
-        if self.memory is not None and self._places is not None:
-            until, root = self._places.clock_end(self._places.places[index]), self.memory.start.sqrt()
-            Q = self._next_memory(self.memory, until, resets=True)
-            z_eta = z + transpose(self.y) * arb_mat(1, z.ncols(), [root] + [0] * (z.ncols() - 1))
-            self._add_memory(terms, index, 0, -1 * (transpose(z_eta) * Q * z_eta))
+        if self.memory is not None:
+            self._add_memory(terms, index, 0, -1 * self.first_memory())
         terms.facts("m/start", self.noise_bounds, z)
         return terms.inequality("start", index, -1)
+
+    def first_memory(self) -> arb_mat:
+        """Return η after the test at t = 0, as a form of the columns of the start."""
+        if self.memory is None or self._places is None:
+            raise ValueError("a rule without a memory")
+        z, root = self.start_columns, self.memory.start.sqrt()
+        until = self._places.clock_end(self._places.places[self.start_location])
+        Q = self._next_memory(self.memory, until, resets=True)
+        z += transpose(self.y) * arb_mat(1, z.ncols(), [root] + [0] * (z.ncols() - 1))
+        return transpose(z) * Q * z
 
 
 def _corners(K: arb_mat, H: arb_mat, q: arb, degree: int) -> tuple[list[arb_mat], arb_mat]:

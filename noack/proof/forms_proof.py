@@ -9,9 +9,10 @@ from typing import Any
 from flint import arb
 
 from noack.proof.event_times import EventTimes, levels_of
-from noack.proof.loop_document import DRIFT, LoopDocument, Table
+from noack.proof.loop_document import DRIFT, ETA, LoopDocument, Table
 from noack.proof.numbers import as_written, quotient, simplest
 from noack.proof.quiet_start import write_quiet_start
+from noack_check.balls import is_zero
 from noack_check.model import Edge, Signal
 
 FORMAT = "noack-forms 1"
@@ -80,6 +81,9 @@ class _Bound:
             if kind in ("c1", "c2"):
                 size = self._size(index, node, name.removeprefix(f"{kind}/"))
                 yield {"square": f"f{kind[1]}", "times": quotient(-number * size)}
+            elif kind == "eta":
+                size = self._size(index, node, name.removeprefix("eta/"))
+                yield {"square": ETA, "times": quotient(number * size)}
             else:
                 theta = simplest(place.nodes[node])
                 for rows_name, sign in self._compared(name.removeprefix(f"a/{place.name}")):
@@ -137,7 +141,22 @@ class _Bound:
             facts += source[silent:] + ([] if model.sources else source[:silent])
         for node, other in edge.pairs:
             table = self._facts(f"m/edge/{edge.name}/{node} {other}", facts)
+            if edge.memory is not None and not is_zero(edge.memory):
+                self._add_memory(table, facts[len(edge.facts) - 1], edge.target, other)
             self._add(f"edge/{name}/{node} {other}", table)
+
+    def _add_memory(self, table: Table, fact: str, target: int, node: int) -> None:
+        """Add the coefficient of η in the target's form to the multiplier of what η is after the test."""
+        numbers = table.setdefault("facts", {})
+        names = [name for name, _ in self._model.names_by_tests(target, node)]
+        total = (
+            as_written(numbers.get(fact, 0.0))
+            if not isinstance(numbers.get(fact), str)
+            else Fraction(numbers[fact])
+        )
+        for name in names:
+            total += as_written(self._numbers[f"eta/{name}"]) * self._size(target, node, name)
+        numbers[fact] = quotient(total)
 
     def _of_silent_edges(self) -> None:
         """A silent test at θ leaves V as it is, minus θ a times the comparison, which is at most 0."""

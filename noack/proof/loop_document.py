@@ -25,6 +25,7 @@ from noack.proof.numbers import (
     matrix,
     product,
     quotient,
+    squares_of,
     to_fraction,
     written,
 )
@@ -52,6 +53,8 @@ _EDGES = {
     "too early": "an event that is proven not to happen",
 }
 """What the ends of names of edges mean."""
+ETA, NEXT_ETA = "√η", "next √η"
+"""The coordinate of a rule's dynamic variable η, and its value after a test."""
 DRIFT = "drift"
 """The output W(ẋ − Hx), as the search calls it."""
 
@@ -117,13 +120,15 @@ class LoopDocument:
     def __init__(
         self, loop: Loop, rate: arb, assumed: Assumptions, outputs: Iterable[str], naming: Naming
     ) -> None:
-        if loop.rule.memory is not None:
-            raise NoDocumentError("a rule with a dynamic variable has no loop document")
+        if loop.rule.memory is not None and loop.noise.ncols():
+            raise NoDocumentError("a rule with a dynamic variable has no loop document with noise")
         if loop.rule.integrates:
             raise NoDocumentError("a rule that integrates has no loop document")
         self.loop, self.rate, self._assumed, self.naming = loop, rate, assumed, naming
         self.model = Model(loop, rate, arb(0), assumed.errors, assumed.noise, **assumed.of_model)
-        used = {c for place in self.model.locations for c in place.coordinates} | {*self.model.sources}
+        self._noise = {*self.model.sources, *self._next_memory}
+        """Coordinates that have no motion."""
+        used = {c for place in self.model.locations for c in place.coordinates} | self._noise
         self.used = sorted(used)
         self._select = columns_of(identity(self.model.size), self.used)
         self._units: dict[int, str] = {}
@@ -169,6 +174,7 @@ class LoopDocument:
         """Return the name of each coordinate of the model; one that is taken has a number."""
         model, n = self.model, self.loop.n
         found = {model.size - 2: "f1", model.size - 1: "f2"}
+        found |= dict.fromkeys(self._memory, ETA) | dict.fromkeys(self._next_memory, NEXT_ETA)
         for kind, rows in (("s", model.s), ("n", model.p)):
             found |= {
                 c: f"{kind}{i}" for i in range(rows.nrows()) for c in range(model.size) if rows[i, c] != 0
@@ -185,9 +191,19 @@ class LoopDocument:
         return found
 
     def _coordinate(self, index: int) -> Table:
-        is_noise = index in self.model.sources
         entry = {"name": self.labels[index], "unit": self._units.get(index, "")}
-        return entry | ({"noise": True} if is_noise else {})
+        return entry | ({"noise": True} if index in self._noise else {})
+
+    @property
+    def _memory(self) -> range:
+        """The coordinate of a dynamic variable, which is √η⁺, if the rule has one."""
+        first = self.model.sources.stop
+        return range(first, first + (self.model.memory is not None))
+
+    @property
+    def _next_memory(self) -> range:
+        """The coordinate of its value after a test."""
+        return range(self._memory.stop, self._memory.stop + len(self._memory))
 
     def has(self, unit: str) -> bool:
         """Return whether the document has a unit, "f1" or "f2"."""
@@ -207,6 +223,8 @@ class LoopDocument:
             )
         if model.sources:
             parts.append("n0, n1, ... are the noise of a measurement")
+        if model.memory is not None:
+            parts.append(f"{ETA} is the root of the rule's dynamic variable η, or 0 where η is below 0")
         parts.append('"j lost": j updates were sent since the one that acts, and all are lost')
         if any("later" in place.name for place in model.locations):
             parts.append('"k later": an update is on its way, and k were sent after it')
@@ -234,7 +252,9 @@ class LoopDocument:
         for name, size, unit in (("level", model.level, "f1"), ("floor", model.floor, "f2")):
             if size > 0 and self.has(unit):
                 self.rows[name] = self._multiple(unit, size)
-        sizes: list[str] = [name for name in ("share", "level", "floor") if name in self.rows]
+        if self._memory:
+            self.rows[ETA] = self.columns(model.y)
+        sizes: list[str] = [name for name in ("share", ETA, "level", "floor") if name in self.rows]
         if "compared" in self.rows:
             words = "no event: the comparison is at most the threshold"
             self._add_fact("silent", ["compared"], [*sizes], words, model.silent)
@@ -244,9 +264,8 @@ class LoopDocument:
             self.rows["least threshold"] = [least]
             sizes.append("least threshold")
         for guard, Q in guards.items():
-            kept = {"c1": ["share", "level"], "c2": ["share", "floor"], "": ["share", "least threshold"]}[
-                guard
-            ]
+            unit = {"c1": "level", "c2": "floor", "": "least threshold"}[guard]
+            kept = ["share", ETA, unit]
             name = {"c1": "event, level", "c2": "event, floor", "": "event"}[guard]
             words = "an event: the comparison is at least the threshold"
             self._add_fact(name, [size for size in kept if size in sizes], ["compared"], words, Q)
@@ -259,6 +278,29 @@ class LoopDocument:
             self._add_fact(f"noise {name}", [name], [unit], "bound of the noise of a measurement", Q)
         if model.errors is not None:
             self._add_assumed()
+        for edge in model.edges:
+            if edge.memory is not None and not is_zero(edge.memory):
+                self._add_memory(edge.memory)
+
+    def _add_memory(self, following: arb_mat) -> None:
+        """Add the facts of a test at which η becomes a form of z: it is at least 0, or it is not."""
+        if _key(-1 * following) in self._named:
+            return
+        number = 1 + len(self._named)
+        self.rows[NEXT_ETA] = [[int(c in self._next_memory) for c in self.used]]
+        for is_positive in (True, False):
+            terms = squares_of(following, self.used, is_above=is_positive)
+            names: dict[bool, list[str]] = {True: [], False: []}
+            for index, (row, sign) in enumerate(terms):
+                name = f"η {number}.{index}{'' if is_positive else ' below 0'}"
+                self.rows[name] = [row]
+                names[sign].append(name)
+            if is_positive:
+                words = "η after the test is at least 0"
+                self._add_fact(f"η {number}", [NEXT_ETA, *names[False]], names[True], words, -1 * following)
+            else:
+                words = "η after the test is below 0"
+                self._add_fact(f"η {number} below 0", names[True], names[False], words, following)
 
     @property
     def _has_plain_terms(self) -> bool:
@@ -305,7 +347,7 @@ class LoopDocument:
 
     def threshold_squared(self, fact: str) -> float:
         """Return c² of a fact that says that the comparison is at least a threshold c f1, or c f2."""
-        names = [name for name in self.facts[fact]["less"] if name != "share"]
+        names = [name for name in self.facts[fact]["less"] if name not in ("share", ETA)]
         return sum(float(Fraction(str(value))) ** 2 for name in names for value in self.rows[name][0])
 
     def noise_columns(self) -> tuple[list[str], Matrix]:
@@ -423,6 +465,8 @@ class LoopDocument:
         for row, c in enumerate(self.used):
             if c not in target.coordinates:  # also of noise, which does not follow from a jump
                 jump[row] = [0] * len(self.used)
+            elif c in self._memory and edge.memory is not None:
+                jump[row] = [int(d in self._next_memory and not is_zero(edge.memory)) for d in self.used]
         if edge.is_test and ", silent" not in edge.name:
             found["event"] = True
         return found | {"clock": self._clock_after(edge), "facts": self.facts_of(edge), "jump": jump}
@@ -471,7 +515,7 @@ class LoopDocument:
                 "when": [0, exact(self.clocks[index] or fmpq(0))],
                 "clock": "zero",
                 "facts": (["silent"] if "silent" in self.facts else []) + noise,
-                "jump": [[int(c == d and c not in self.model.sources) for d in self.used] for c in self.used],
+                "jump": [[int(c == d and c not in self._noise) for d in self.used] for c in self.used],
             }
 
     @property
@@ -486,6 +530,10 @@ class LoopDocument:
     def _start(self) -> Table:
         model = self.model
         columns = matrix(rows_of(model.start_columns, self.used))
+        if self._memory:
+            columns = [[*row, int(c in self._next_memory)] for c, row in zip(self.used, columns, strict=True)]
+            first = least_above(model.first_memory()[0, 0].max(arb(0)).sqrt())
+            columns[self.used.index(self._memory[0])] = [first, 0]
         facts = [self.fact(Q) for Q in model.noise_bounds]
         location = model.locations[model.start_location].name
         return {"location": location, "columns": columns, "facts": facts}

@@ -1,11 +1,15 @@
 """Numbers of a file, as JSON has them: decimals, quotients "p/q", and intervals that are rounded outwards."""
 
 import math
+from collections.abc import Sequence
 from fractions import Fraction
 
+import numpy as np
 from flint import arb, arb_mat, fmpq
 
 _MOST_DENOMINATOR = 10**12
+_SMALL, _ROUNDED = 1e-14, 1e-12
+"""Shares below which an eigenvalue is 0, and by which others are rounded outwards."""
 Number = int | float | str
 Fractions = list[list[Fraction]]
 """The rows of an exact matrix."""
@@ -97,6 +101,22 @@ def quotient(value: Fraction) -> Number:
 def matrix(M: arb_mat) -> list[list[Number | list[float]]]:
     """Return a matrix."""
     return [[entry(M[i, j]) for j in range(M.ncols())] for i in range(M.nrows())]
+
+
+def squares_of(Q: arb_mat, used: Sequence[int], *, is_above: bool) -> list[tuple[list[Number], bool]]:
+    """Return rows R with Q ≤ Σ ±|Rz|² for some of the coordinates of z, each with whether its sign is plus.
+
+    ``is_above``: else Q ≥ the sum.
+    """
+    M = np.array([[float(Q[i, j].mid()) for j in used] for i in used])
+    values, vectors = np.linalg.eigh(M)
+    found = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if abs(value) > _SMALL * np.abs(values).max():
+            outwards = 1 + (_ROUNDED if (value > 0) == is_above else -_ROUNDED)
+            row = np.where(np.abs(vector) > _SMALL, math.sqrt(abs(value) * outwards) * vector, 0.0)
+            found.append(([exact(float(entry)) for entry in row], bool(value > 0)))
+    return found
 
 
 def product(left: Fractions, right: Fractions) -> Fractions:

@@ -11,7 +11,7 @@ import pytest
 from flint import arb
 
 from noack.proof.forms_proof import as_text, write_proof
-from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
+from noack.proof.loop_document import LoopDocument, Naming
 from noack.proof.words import in_words
 from noack_check.document import read_number
 from noack_check.proof import read_assumptions
@@ -22,9 +22,9 @@ from tests.checker.proofs import SEARCHES, Proved, proved
 Table = dict[str, Any]
 Change = Callable[[Table, Table], None]
 A_LOOP = Naming("a loop")
-WITH_MEMORY = {"tests_dynamic", "tests_held"}
 OF_EACH_KIND = {
     "claims_box",
+    "tests_dynamic",
     "changed_later",
     "changed_noisy",
     "filtered_mass",
@@ -58,10 +58,7 @@ def proven(document: Table, proof: Table) -> list[Statement]:
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=() if name in OF_EACH_KIND else pytest.mark.deep)
-        for name in sorted({*SEARCHES} - WITH_MEMORY)
-    ],
+    [pytest.param(name, marks=() if name in OF_EACH_KIND else pytest.mark.deep) for name in sorted(SEARCHES)],
 )
 def test_the_kernel_proves_what_the_checker_proves(name: str) -> None:
     stored = proved(name)
@@ -74,12 +71,6 @@ def test_the_kernel_proves_what_the_checker_proves(name: str) -> None:
         assert [float(arb(level).mid()) for level in statement.levels] == pytest.approx(levels, rel=1e-15)
         assert statement.from_start == entry.get("from_start", True)
     assert in_words(document).startswith("# Loop document: a loop\n")
-
-
-@pytest.mark.parametrize("name", sorted(WITH_MEMORY))
-def test_a_rule_with_a_dynamic_variable_has_no_document(name: str) -> None:
-    with pytest.raises(NoDocumentError, match="dynamic variable"):
-        files_of(proved(name))
 
 
 @pytest.mark.parametrize("state", ["f1", "f2", "e rate", "w rate", "f1 (2)"])
