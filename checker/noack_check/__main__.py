@@ -1,6 +1,6 @@
 """``noack-check witness.json [--scenario resolved.toml] [--equations FILE]``: verifies a file of witnesses.
 
-``noack-check DOCUMENT PROOF`` verifies a proof of a loop document instead, by :mod:`noack_kernel`.
+``noack-check DOCUMENT PROOF`` verifies a proof of a document instead: see :mod:`noack_verify`.
 
 Prints PROVED and what was proven, for each statement of the file, or REJECTED and the first inequality
 that fails. Exit status: 0 if all are proven, 1 if one is not, 2 for a file that cannot be read or written.
@@ -31,7 +31,7 @@ from noack_check.sentences import (
     quoted,
     sentences,
 )
-from noack_kernel.__main__ import verify
+from noack_verify import verify
 
 _PLANTS = {
     "own": "its plant",
@@ -159,6 +159,10 @@ def check_file(file: Table, given: Table | None, equations: str | None = None) -
             growth = prove_growth(read_periodic_loop(scenario), document)
             yield from (f"PROVED {of}, nothing late: {sentence}" for sentence in growth_sentences(growth))
             continue
+        if "bounds" not in document and "gains" in document:
+            raise RejectedError(
+                "a statement by gains has a document of its own: `noack certify NAME --document D --proof P`"
+            )
         enclosed = read_enclosed(scenario, document) if plants == "region" else None
         loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal", enclosed=enclosed)
         if enclosed is not None:

@@ -25,11 +25,9 @@ from typing import Any, NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.apart import share_of_threshold
 from noack_check.balls import around_zero, frobenius, identity, is_zero, rows_of, upto
 from noack_check.check import RejectedError, verify
 from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
-from noack_check.gains import Gains
 from noack_check.loop import Loop, Noise, Region, Smooth, Times
 from noack_check.model import Chain, Errors, Model, thresholds
 from noack_check.noise import noise_of
@@ -80,8 +78,8 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
         raise RejectedError("not a table")
     rate = read_number(document, "rate")
     assumed = read_assumptions(loop, rate, document)
-    entries = _entries(document, "bounds") if "bounds" in document or "gains" not in document else []
-    if not entries and "gains" not in document:
+    entries = _entries(document, "bounds")
+    if not entries:
         raise RejectedError("bounds: there is none")
     if len({(str(e.get("output")), bool(e.get("from_start", True))) for e in entries}) < len(entries):
         raise RejectedError("bounds: an output occurs twice")
@@ -104,30 +102,18 @@ def conclude(
         apart, first = _times_between_events(loop, rate, proven["drift"], assumed, document)
         bounds.append(sensor_error(loop, rate, proven["drift"]))
     sensor = bounds[-1] if "drift" in proven else proven.get("e_s")
-    gains = Gains(loop, rate, read_table(document, "gains")) if "gains" in document else None
-    by_gains = None if gains is None else _apart_by_gains(loop, gains, read_table(document, "gains"))
-    if of_forms:
-        is_quiet = require_few_at_start(loop, assumed)
-        require_few_later(loop, assumed, apart if is_quiet else None)
-    else:
-        is_quiet = _is_quiet(loop, by_gains)
-    if by_gains is not None:
-        apart, first = (max(time or by_gains, by_gains) for time in (apart, first))
+    is_quiet = require_few_at_start(loop, assumed)
+    require_few_later(loop, assumed, apart if is_quiet else None)
     if assumed.errors is not None:
         _require_errors(loop, rate, proven, assumed.errors)
     if loop.region is not None:
-        _require_region(loop.region, proven, {} if gains is None else gains.bounds)
+        _require_region(loop.region, proven)
     if assumed.chain is not None and sensor is not None:
         jumps = assumed.chain.factor(loop.losses, 1 + assumed.later if loop.times.delay > 0 else 0)
         noise = noise_of(loop, rate).sizes
         decaying = sensor.decaying + jumps * (sensor.decaying + noise[0])
         constant = sensor.constant + jumps * (sensor.constant + noise[1])
         bounds.append(Bound("e_c", decaying, constant, True))
-    if gains is not None:
-        bounds += [Bound(output, *sizes, True) for output, sizes in gains.bounds.items()]
-        if loop.needs_constant and rate > 0 and loop.until is None:  # then what the start adds is in f₁
-            of_state = [pair for pair in gains.bounds.items() if pair[0][0] in "xy"]
-            bounds += [Bound(output, arb(0), constant, False) for output, (_, constant) in of_state]
     if not all(size.is_finite() for bound in bounds for size in (bound.decaying, bound.constant)):
         raise RejectedError("bounds: not finite")
     is_moved = loop.loads > 0 or loop.until is not None or loop.push_before_input is not None
@@ -151,30 +137,6 @@ def _about(loop: Loop, bound: Bound) -> Bound:
     if "[" in output:
         row = rows_of(row, [int(output[2:-1])])
     return bound._replace(constant=bound.constant + loop.offset * spectral_norm(row))
-
-
-def _apart_by_gains(loop: Loop, gains: Gains, table: Mapping[str, object]) -> fmpq | None:
-    """Return a least time between any two events, as proven; None: the document states none.
-
-    The rule is that of the loop: one for which it is taken has other events.
-    """
-    if "inter_event_s" not in table:
-        return None
-    apart = _time(table, "inter_event_s")
-    _require_silent(loop, apart)
-    if apart > 0 and not share_of_threshold(gains, arb(apart)) < 1:
-        raise RejectedError("inter_event_s: an event may come earlier")
-    return apart
-
-
-def _is_quiet(loop: Loop, apart: fmpq | None) -> bool:
-    """Return whether it is proven that no event follows the one at t = 0 before the first input acts."""
-    if apart is not None and apart >= loop.times.start:
-        return True
-    try:
-        return require_few_at_start(loop, Assumptions(None, 0, 0, None))
-    except RejectedError:
-        return False
 
 
 class Assumptions(NamedTuple):
@@ -582,9 +544,7 @@ def _require_errors(loop: Loop, rate: arb, proven: Mapping[str, Bound], errors: 
         raise RejectedError("errors: the sensor's error may exceed them")
 
 
-def _require_region(
-    region: Region, proven: Mapping[str, Bound], by_gains: Mapping[str, tuple[arb, arb]]
-) -> None:
+def _require_region(region: Region, proven: Mapping[str, Bound]) -> None:
     """Prove that x and u stay in the region: their bounds are below its limits, strictly.
 
     Up to some time they are in it; so all bounds hold, also at this time, since x is continuous and no
@@ -594,14 +554,10 @@ def _require_region(
         for index, limit in enumerate(limits):
             if limit is None:
                 continue
-            name, sizes = f"{kind}[{index}]", []
-            if name in proven:
-                sizes.append((proven[name].decaying ** 2 + proven[name].constant ** 2).sqrt())
-            if name in by_gains:
-                sizes.append(sum(by_gains[name], arb(0)))
-            if not sizes:
+            name = f"{kind}[{index}]"
+            if name not in proven:
                 raise RejectedError(f"region: {name} has no bound from the start on")
-            if not any(size < limit for size in sizes):
+            if not (proven[name].decaying ** 2 + proven[name].constant ** 2).sqrt() < limit:
                 raise RejectedError(f"region: {name} may leave it")
 
 

@@ -3,35 +3,51 @@
 from cosim.analysis.witnesses import WitnessedStatement, Witnesses
 from noack.core.errors import CallerError
 from noack.proof.files import ProofFiles, proof_files
+from noack.proof.gains_document import GainsFiles, gains_files
 from noack.proof.loop_document import Naming, NoDocumentError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
+from noack_check.loop import Loop
 
 _PLANTS = {"own": "the plant", "box": "all plants of its uncertainty", "region": "the plant's equations"}
 _CONDITIONS = {"schedule": "its schedule", "ideal": "ideal conditions"}
 
 
 def loop_files(resolved: Scenario, statement: WitnessedStatement) -> ProofFiles:
-    """Return the files of a statement about a resolved scenario.
+    """Return the files of a statement about a resolved scenario that has bounds by quadratic forms.
 
     Raises:
         CallerError: nothing is proven, or there is no loop document; the message says why.
     """
-    if statement.document is None or statement.loop is None:
-        raise CallerError(f"there is no proof: {statement.reason}")
+    loop, document = _proven(statement)
     try:
-        return proof_files(statement.loop, statement.document, naming_of(resolved, statement))
+        return proof_files(loop, document, naming_of(resolved, statement))
     except NoDocumentError as error:
         raise CallerError(f"there is no loop document: {error}") from None
 
 
-def files_of_widest(resolved: Scenario, witnesses: Witnesses) -> ProofFiles:
+def files_of_widest(resolved: Scenario, witnesses: Witnesses) -> ProofFiles | GainsFiles:
     """Return the files of the statement that covers most: see :func:`widest`.
+
+    If it rests on small gains alone, they are those of the verifier of bounds by gains.
 
     Raises:
         CallerError: as :func:`loop_files`.
     """
-    return loop_files(resolved, widest(witnesses))
+    statement = widest(witnesses)
+    loop, document = _proven(statement)
+    if document.get("bounds"):
+        return loop_files(resolved, statement)
+    try:
+        return gains_files(loop, document, naming_of(resolved, statement))
+    except NoDocumentError as error:
+        raise CallerError(f"there is no document: {error}") from None
+
+
+def _proven(statement: WitnessedStatement) -> tuple[Loop, dict[str, object]]:
+    if statement.document is None or statement.loop is None:
+        raise CallerError(f"there is no proof: {statement.reason}")
+    return statement.loop, statement.document
 
 
 def widest(witnesses: Witnesses) -> WitnessedStatement:

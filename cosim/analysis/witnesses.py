@@ -21,6 +21,7 @@ from noack.core.progress import Progress, no_progress, part_of
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations, trace
 from noack.proof.files import proof_files
 from noack.proof.loop_document import Naming, NoDocumentError
+from noack.proof.statement_proof import prove_statement
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import with_stated_numbers
@@ -41,7 +42,7 @@ from noack_check.document import read_table
 from noack_check.equations import equation_lines, read_region
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
-from noack_check.proof import Proof, prove
+from noack_check.proof import Proof
 from noack_check.scenario import Enclosed as EnclosedPlant
 from noack_check.scenario import read_loop
 from noack_kernel import RejectedError as RejectedByKernelError
@@ -97,7 +98,10 @@ class Witnesses(NamedTuple):
 
     def file_text(self) -> str:
         """Return the file that ``noack-check`` reads."""
-        documents = [s.document for s in self.statements if s.document is not None]
+        every = [s.document for s in self.statements if s.document is not None and "bounds" in s.document]
+        if not every:
+            raise CallerError("--witness: these are small-gain bounds; use --document and --proof instead")
+        documents = [{key: value for key, value in d.items() if key != "gains"} for d in every]
         return json.dumps({"scenario": self.scenario, "statements": documents}, allow_nan=False)
 
     def equations_text(self) -> str:
@@ -273,7 +277,12 @@ def known_or_found(
         )
 
     return _known_or_found(
-        WitnessStore(loop), outputs, ultimate, most_work, search, lambda document: prove(loop, document)
+        WitnessStore(loop),
+        outputs,
+        ultimate,
+        most_work,
+        search,
+        partial(prove_statement, loop),
     )
 
 
@@ -317,9 +326,17 @@ def known_or_found_on_region(
         widths = [np.inf if limit is None else float(limit) for limit in (*region.x, *region.u)]
         return plant.on(np.array(widths))[1]
 
+    def proven(document: Mapping[str, object]) -> Proof:
+        return prove_statement(loop_on(document), document)
+
     store = WitnessStore((loop, equations.document))
     witness = _known_or_found(
-        store, outputs, ultimate, most_work, search, lambda document: prove(loop_on(document), document)
+        store,
+        outputs,
+        ultimate,
+        most_work,
+        search,
+        proven,
     )
     return witness, loop_on(witness.document)
 

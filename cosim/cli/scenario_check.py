@@ -14,7 +14,6 @@ from cosim.live.launcher import DEFAULT_START_S
 from cosim.output.run_document import assumption_table
 from cosim.output.terminal_writer import terminal_table
 from noack.core.clock import NS_PER_S
-from noack.proof.words import in_words
 from noack.scenario.resolution import ResolvedRun, policy_of, resolve
 from noack.scenario.scenario import Scenario, loop_names
 from noack.scenario.scenario_file import dumps
@@ -62,7 +61,7 @@ def print_document(loaded: Scenario, *, json: bool) -> None:
     resolved = resolve(loaded)
     known = find_witnesses(resolved, most_work=0.0, conditions=("schedule",))
     files = files_of_widest(resolved, known)
-    print(files.document if json else in_words(files.table), end="" if json else "\n")
+    print(files.document if json else files.words, end="" if json else "\n")
 
 
 def _make_trigger(resolved: Scenario) -> None:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from noack.proof.forms_proof import as_text, write_proof
 from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
+from noack.proof.words import in_words
 from noack_check.document import read_number
 from noack_check.loop import Loop
 from noack_check.proof import compares_error, read_assumptions
@@ -19,6 +20,11 @@ class ProofFiles(NamedTuple):
     document: str
     proof: str
     """The contents of the files."""
+
+    @property
+    def words(self) -> str:
+        """The document as text."""
+        return in_words(self.table)
 
     def verify(self) -> Proven:
         """Return what the kernel proves; raise its RejectedError if it rejects the proof."""
@@ -47,8 +53,8 @@ def _bounds(statement: Mapping[str, object]) -> list[Any]:
     bounds = statement.get("bounds")
     if not isinstance(bounds, list) or not bounds:
         raise NoDocumentError(
-            "the bounds are small-gain bounds, and only bounds by quadratic forms have one; "
-            "noack certify NAME --witness FILE writes what proves them"
+            "the bounds are small-gain bounds, of a document of another format; noack certify NAME "
+            "--document D --proof P writes it"
         )
     return bounds
 

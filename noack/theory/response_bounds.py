@@ -1,6 +1,6 @@
 """Responses C e^{Mt} Y of a linear system: the largest norm and the integral of the norm, enclosed.
 
-The enclosures are those of :mod:`noack_check.responses`.
+The enclosures are those of :mod:`noack_gains.responses`.
 """
 
 from typing import NamedTuple
@@ -11,8 +11,8 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from noack.core.linear_systems import Matrix
 from noack_check.balls import matrix, number
-from noack_check.check import RejectedError
-from noack_check.responses import Decay, responses
+from noack_gains import RejectedError
+from noack_gains.responses import Decay, responses
 
 
 class NotDecayingError(ArithmeticError):

@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 from flint import fmpq
 
+from noack.proof.statement_proof import prove_statement
 from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
-from noack_check.proof import Proof, prove
+from noack_check.proof import Proof
 
 Document = dict[str, Any]
 Rng = np.random.Generator
@@ -18,7 +19,7 @@ Rng = np.random.Generator
 def accepted(loop: Loop, document: Document) -> Proof | None:
     """Return what a document proves, or None if it is rejected."""
     try:
-        return prove(loop, document)
+        return prove_statement(loop, document)
     except RejectedError:
         return None
 

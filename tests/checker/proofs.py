@@ -17,14 +17,19 @@ from flint import arb, fmpq
 
 from cosim.analysis.witness_store import WitnessStore
 from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
+from noack.proof.gains_document import gains_files
+from noack.proof.loop_document import Naming
+from noack.proof.statement_proof import prove_statement
 from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.witnesses.documents import Witness, find_witness, witness_by_gains
 from noack.theory.witnesses.outward import proven_bounds
 from noack_check.balls import matrix
 from noack_check.loop import Loop
-from noack_check.proof import Proof, prove
+from noack_check.proof import Proof
 from noack_check.scenario import read_enclosed, read_loop
 from noack_check.times import Schedule
+from noack_gains import Document as GainsDocument
+from noack_gains import Gains, read_proof
 from tests.checker.loops import (
     ASSUMED,
     DRIFTING,
@@ -227,12 +232,19 @@ def by_gains(loop: Loop) -> tuple[Document, Proof]:
     return dict(witness.document), witness.proof
 
 
+def gains_of(loop: Loop, document: Mapping[str, object]) -> Gains:
+    """Return the argument by gains of a document that is found by a search."""
+    files = gains_files(loop, document, Naming("loop"))
+    of = GainsDocument(files.document)
+    return Gains(of, read_proof(of, files.proof))
+
+
 @functools.cache
 def proved(name: str) -> Proved:
     """Return a stored document, checked against its loop."""
     document = json.loads((FOLDER / f"{name}.json").read_text())
     loop = SEARCHES[name].loop_of(document)
-    return Proved(loop, document, prove(loop, document))
+    return Proved(loop, document, prove_statement(loop, document))
 
 
 def use_stored(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:

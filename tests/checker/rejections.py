@@ -5,17 +5,17 @@ from typing import Any
 
 import pytest
 
+from noack.proof.statement_proof import prove_statement
 from noack_check.balls import is_positive, matrix, number
 from noack_check.check import RejectedError, _value
 from noack_check.loop import Loop
 from noack_check.model import Model
-from noack_check.proof import prove
 
 
 def rejects(loop: Loop, document: object, match: str) -> None:
     """Require that a document is rejected, and for the reason that is meant."""
     with pytest.raises(RejectedError, match=match) as caught:
-        prove(loop, document)  # type: ignore[arg-type]
+        prove_statement(loop, document)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) <= 300
 

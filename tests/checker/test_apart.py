@@ -3,20 +3,22 @@
 import copy
 import itertools
 import math
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb, fmpq
+from flint import fmpq
 
+from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.documents import witness_by_gains
-from noack_check.apart import _sum_of_vectors, reached, share_of_threshold
 from noack_check.balls import beside, identity, matrix, number, square, zeros
 from noack_check.check import RejectedError
-from noack_check.gains import Gains
 from noack_check.loop import Loop
-from noack_check.proof import Proof, prove
+from noack_check.proof import Proof
+from noack_gains.apart import _sum_of_vectors, reached, share_of_threshold
 from tests.checker.loops import IDEAL, NOISE, SCHEDULE, changed, scalar, steady
+from tests.checker.proofs import gains_of
 from tests.checker.shortest import shortest_times
 
 _NEAR = 0.97
@@ -26,6 +28,11 @@ _NEAR = 0.97
 def proven(loop: Loop) -> tuple[dict[str, Any], Proof]:
     witness = witness_by_gains(loop, ("x", "e_s", "e_c"))
     return dict(witness.document), witness.proof
+
+
+def exactly(value: float) -> fmpq:
+    """Return the decimal of a float, as a proof has it."""
+    return fmpq(*Fraction(repr(value)).as_integer_ratio())
 
 
 def least_time(loop: Loop) -> float:
@@ -62,7 +69,7 @@ def test_a_run_nearly_has_the_least_time(loop: Loop) -> None:
     document["gains"]["inter_event_s"] *= 1.05
     assert document["gains"]["inter_event_s"] > shortest
     with pytest.raises(RejectedError, match="an event may come earlier"):
-        prove(loop, document)
+        prove_statement(loop, document)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +92,7 @@ def test_a_time_for_less_is_not_one_for_more(loop: Loop, lie: Loop) -> None:
     document = copy.deepcopy(proven(loop)[0])
     document["gains"]["inter_event_s"] = false
     with pytest.raises(RejectedError, match="an event may come earlier"):
-        prove(loop, document)
+        prove_statement(loop, document)
 
 
 def test_errors_of_older_lost_updates_have_fallen() -> None:
@@ -93,9 +100,9 @@ def test_errors_of_older_lost_updates_have_fallen() -> None:
     loop = steady(3)._replace(gain=number(-0.7) * identity(1))
     document, proof = proven(loop)
     stated = document["gains"]["inter_event_s"]
-    assert proof.inter_event == number(stated).fmpq()
+    assert proof.inter_event == exactly(stated)
     assert 0.85 * least_time(loop) < stated <= least_time(loop)
-    (gains,) = (unit for unit in Gains(loop, arb(0), document["gains"]).units)
+    (gains,) = (unit for unit in gains_of(loop, {**document, "rate": 0.0}).units)
     young, old = (float(gains.value(gains.lost("p 0", number(time)))) for time in (0.0, stated))
     decay = [math.exp(-0.4 * k * stated) for k in range(3)]
     assert old / young == pytest.approx(sum(decay) / 3, rel=1e-3)
@@ -112,7 +119,7 @@ def test_both_parts_of_a_threshold_do_not_count_at_its_kink() -> None:
     """There v = 0.1, and 9v + 1 is what two units make of a threshold of 1."""
     loop = steady(2, level=10.0)
     document, _ = proven(loop)
-    gains = Gains(loop, number(document["rate"]), document["gains"])
+    gains = gains_of(loop, document)
     time = number(document["gains"]["inter_event_s"])
     assert gains.single is not None
     assert share_of_threshold(gains, time) < 1
@@ -144,10 +151,10 @@ def test_the_next_test_after_silent_ones_is_the_first_that_may_be_an_event() -> 
     assert tests is not None
     assert 1 / 50 < stated < float(tests) < stated + 1 / 50
     assert (50 * tests).q == 1
-    nearer = prove(changed(loop, least_sampling=fmpq(1, 51)), document).inter_event
-    assert nearer == max(number(stated).fmpq(), fmpq(50, 51) * tests)
+    nearer = prove_statement(changed(loop, least_sampling=fmpq(1, 51)), document).inter_event
+    assert nearer == max(exactly(stated), fmpq(50, 51) * tests)
     far = changed(loop, least_sampling=fmpq(1, 500))
-    assert prove(far, document).inter_event == number(stated).fmpq()
+    assert prove_statement(far, document).inter_event == exactly(stated)
 
 
 def test_without_a_comparison_events_are_as_far_apart_as_tests() -> None:

@@ -5,10 +5,11 @@ import pytest
 from flint import arb, fmpq
 from scipy.linalg import expm
 
+from noack.proof.statement_proof import prove_statement
 from noack_check.balls import identity, matrix, number
 from noack_check.check import RejectedError
 from noack_check.model import Chain, Errors, Model
-from noack_check.proof import error_without_input, prove
+from noack_check.proof import error_without_input
 from tests.checker.completed import completed
 from tests.checker.loops import ASSUMED, SCHEDULE, bounds_of, changed, double_integrator
 from tests.checker.proofs import Proved, proved
@@ -31,13 +32,13 @@ def test_errors_below_those_that_are_proven_are_rejected(found: Proved, share: f
     sensor = next(bound for bound in found.proof.bounds if bound.output == "e_s")
     errors = {name: share * float(getattr(sensor, name)) for name in ("decaying", "constant")}
     with pytest.raises(RejectedError, match="errors: the sensor's error may exceed them"):
-        prove(found.loop, {**found.document, "errors": errors})
+        prove_statement(found.loop, {**found.document, "errors": errors})
 
 
 def test_larger_errors_are_not_covered_by_the_same_forms(found: Proved) -> None:
     larger = {name: 1.5 * size for name, size in found.document["errors"].items()}
     with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
-        prove(found.loop, {**found.document, "errors": larger})
+        prove_statement(found.loop, {**found.document, "errors": larger})
 
 
 @pytest.mark.parametrize("change", ["slower tests", "later updates", "more losses", "another plant"])
@@ -56,7 +57,7 @@ def test_a_witness_proves_nothing_about_another_loop(found: Proved, change: str)
         "another plant": "x: flow/0 lost/",
     }[change]
     with pytest.raises(RejectedError, match=f"^({reason})"):
-        prove(other, completed(other, found.document, whole=True))
+        prove_statement(other, completed(other, found.document, whole=True))
 
 
 def test_facts_about_errors_bound_those_of_each_location() -> None:

@@ -14,6 +14,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.observers.kalman import KalmanSettings
 from noack.observers.observer_settings import EstimationModel
+from noack.proof.statement_proof import prove_statement
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import resolve
@@ -21,7 +22,6 @@ from noack.settings.section import rows_of
 from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
-from noack_check.proof import prove
 from noack_check.scenario import read_loop
 from tests.checker.completed import completed
 from tests.checker.loops import FILTERED_MASS
@@ -214,7 +214,7 @@ def test_the_proof_of_another_filter_is_rejected(document: Document, name: str) 
     tables = resolved_tables("double_integrator", *MASS, setting)
     loop = read_loop(tables, box=False, ideal=False)
     with pytest.raises(RejectedError, match=f"^x: {reason}"):
-        prove(loop, completed(loop, document))
+        prove_statement(loop, completed(loop, document))
 
 
 def test_another_gain_at_one_measurement_is_rejected(document: Document) -> None:
@@ -225,7 +225,7 @@ def test_another_gain_at_one_measurement_is_rejected(document: Document) -> None
         gains[test] = gains[test] * number(1.5)
         other = loop._replace(observer=loop.observer._replace(gains=tuple(gains)))
         with pytest.raises(RejectedError, match=r"^x: edge/"):
-            prove(other, completed(other, document))
+            prove_statement(other, completed(other, document))
 
 
 def test_random_runs_of_the_loop_with_its_gains_stay_within_the_bounds() -> None:

@@ -6,7 +6,7 @@ import pytest
 from flint import arb
 
 from noack_check.balls import identity, matrix, number
-from noack_check.responses import Decay, EnclosedResponses, Question, enclose, responses
+from noack_gains.responses import Decay, EnclosedResponses, Question, enclose, responses
 
 _ACCURACY = 2e-3
 """Of enclosed responses, relatively."""

@@ -6,12 +6,13 @@ from flint import fmpq
 from scipy.linalg import expm
 from scipy.optimize import linprog
 
+from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.documents import find_witness
 from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Model
-from noack_check.proof import Proof, prove
+from noack_check.proof import Proof
 from noack_check.sentences import assumptions
 from tests.checker.completed import completed
 from tests.checker.loops import double_integrator, loop_with, servo
@@ -59,9 +60,9 @@ def test_no_run_with_leads_exceeds_the_bounds_of_either_proof(seed: int) -> None
 def test_a_proof_of_ages_from_0_on_is_none_of_earlier_ones() -> None:
     loop = double_integrator()
     document = find_witness(loop).document
-    prove(loop, document)
+    prove_statement(loop, document)
     with pytest.raises(RejectedError, match="flow/"):
-        prove(leading(loop, fmpq(3, 10)), completed(leading(loop, fmpq(3, 10)), document))
+        prove_statement(leading(loop, fmpq(3, 10)), completed(leading(loop, fmpq(3, 10)), document))
 
 
 def test_bounds_by_gains_grow_with_the_lead() -> None:

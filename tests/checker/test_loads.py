@@ -7,6 +7,7 @@ from flint import arb, fmpq
 
 from cosim.analysis.witnesses import resolved_content
 from cosim.simulation.virtual_time import simulate
+from noack.proof.statement_proof import prove_statement
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack_check.__main__ import check_file
@@ -14,7 +15,7 @@ from noack_check.balls import frobenius
 from noack_check.check import RejectedError
 from noack_check.document import read_number
 from noack_check.keys import RefusedError
-from noack_check.proof import Bound, conclude, error_without_input, prove, prove_bound, read_assumptions
+from noack_check.proof import Bound, conclude, error_without_input, prove_bound, read_assumptions
 from noack_check.scenario import read_loop
 from noack_check.sentences import meaning
 from tests.checker.completed import completed
@@ -160,7 +161,7 @@ def test_no_simulated_run_exceeds_it(statement: Proved) -> None:
 def test_the_bound_is_none_of_a_larger_load(statement: Proved) -> None:
     larger = read_loop(motor("plant.load=[2.0]"), box=False, ideal=False)
     with pytest.raises(RejectedError, match=r"^x: flow/start, "):
-        prove(larger, completed(larger, statement.document))
+        prove_statement(larger, completed(larger, statement.document))
 
 
 def test_the_bound_is_none_of_a_slower_observer(statement: Proved) -> None:
@@ -168,4 +169,4 @@ def test_the_bound_is_none_of_a_slower_observer(statement: Proved) -> None:
     tables["observer"]["gain"][2] = [entry / 10 for entry in tables["observer"]["gain"][2]]
     loop = read_loop(tables, box=False, ideal=False)
     with pytest.raises(RejectedError, match=r"^x: edge/0 lost, "):
-        prove(loop, completed(loop, statement.document))
+        prove_statement(loop, completed(loop, statement.document))

@@ -10,8 +10,9 @@ import functools
 import numpy as np
 import pytest
 
+from noack.proof.statement_proof import prove_statement
 from noack_check.loop import Loop
-from noack_check.proof import Proof, prove
+from noack_check.proof import Proof
 from tests.checker.changes import DOCUMENTS, LOOPS, Document, accepted
 from tests.checker.completed import completed
 from tests.checker.floating_forms import Forms
@@ -33,7 +34,7 @@ def with_errors(known: Proved) -> Document:
     sensor = [bound for bound in known.proof.bounds if bound.output == "e_s"][-1]
     errors = {"decaying": float(sensor.decaying.mid()) * 1.001, "constant": 0.0}
     found = completed(known.loop, {**known.document, "errors": errors}, whole=True)
-    prove(known.loop, found)
+    prove_statement(known.loop, found)
     return found
 
 
@@ -71,7 +72,7 @@ def mutated_loop(name: str, change: str, seed: int) -> bool:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_documents_are_true(name: str) -> None:
     loop, document = base(name)
-    require_true(loop, document, prove(loop, document), 0, runs=1)
+    require_true(loop, document, prove_statement(loop, document), 0, runs=1)
 
 
 SOME_DOCUMENTS = (

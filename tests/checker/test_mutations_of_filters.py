@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from cosim.analysis.witnesses import find_statement
+from noack.proof.statement_proof import prove_statement
 from noack_check.balls import matrix, number
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop, Noise
 from noack_check.noise import noise_of
-from noack_check.proof import Proof, prove, read_assumptions
+from noack_check.proof import Proof, read_assumptions
 from noack_check.scenario import read_loop
 from tests.checker.changes import DOCUMENTS, GAINS, accepted, places
 from tests.checker.loops import FILTERED_MASS
@@ -158,7 +159,7 @@ def base(name: str) -> Base:
 def proven(tables: Tables, document: Mapping[str, object]) -> tuple[Loop, Proof] | None:
     try:
         loop = read_loop(tables, box=False, ideal=False)
-        return loop, prove(loop, document)
+        return loop, prove_statement(loop, document)
     except (RejectedError, RefusedError):
         return None
 
@@ -252,7 +253,7 @@ def changed_scenario(name: str, change: str, rng: Rng) -> Tables:
 )
 def test_changed_scenarios_make_nothing_false_proven(name: str, count: int, seconds: float) -> None:
     of, rng = base(name), np.random.default_rng(count)
-    old, W = prove(of.loop, of.document), floats(of.loop.weight)
+    old, W = prove_statement(of.loop, of.document), floats(of.loop.weight)
     noise, rate = noise_of(of.loop, old.rate), float(old.rate)
     assert share_of_error(true_errors(of.tables, of.loop, old, seconds=seconds), noise, rate, W) > _NEAR
     tried, true, others = 0, 0, 0
@@ -286,7 +287,7 @@ def test_changed_scenarios_make_nothing_false_proven(name: str, count: int, seco
 def test_changed_documents_prove_nothing_false(name: str, count: int) -> None:
     of, rng, rejected = base(name), np.random.default_rng(count), 0
     changes = [*(GAINS if name == "by gains" else DOCUMENTS).values()]
-    proofs = [prove(of.loop, of.document)]
+    proofs = [prove_statement(of.loop, of.document)]
     for k in range(count):
         document = copy.deepcopy(of.document)
         changes[k % len(changes)](document, rng)

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 
 from cosim.analysis.witnesses import resolved_content
+from noack.proof.statement_proof import prove_statement
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
-from noack_check.proof import Proof, prove
+from noack_check.proof import Proof
 from noack_check.scenario import read_enclosed, read_loop
 from tests.checker.changes import DOCUMENTS
 from tests.checker.proofs import proved
@@ -86,7 +87,7 @@ CHANGES = [_number, _operation, _operand, _rates, _region, _further, *DOCUMENTS.
 def proven(content: Document, document: Document) -> tuple[Loop, Proof] | None:
     try:
         loop = read_loop(content, box=False, ideal=True, enclosed=read_enclosed(content, document))
-        return loop, prove(loop, document)
+        return loop, prove_statement(loop, document)
     except (RejectedError, RefusedError):
         return None
 

@@ -9,6 +9,7 @@ import pytest
 from flint import arb, fmpq
 from scipy.linalg import expm
 
+from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.assumptions import smooth_part
 from noack_check.balls import matrix, number, zeros
 from noack_check.check import RejectedError
@@ -16,7 +17,6 @@ from noack_check.keys import RefusedError
 from noack_check.loop import Loop, Noise, Smooth
 from noack_check.model import Model
 from noack_check.noise import noise_of
-from noack_check.proof import prove
 from noack_check.scenario import read_loop
 from tests.checker.completed import completed
 from tests.checker.loops import OBSERVED, OBSERVED_OUTPUT
@@ -271,7 +271,7 @@ def test_a_smooth_part_is_a_table(witness: Proved, value: object, reason: str) -
 
 def test_a_document_without_the_smooth_part_proves_nothing(witness: Proved) -> None:
     document: dict[str, Any] = copy.deepcopy(witness.document)
-    prove(LOOP, document)
+    prove_statement(LOOP, document)
     del document["observer"]
     rejects(LOOP, document, r"^x: X is not a symmetric \(2, 2\)")
 

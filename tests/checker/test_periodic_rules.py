@@ -9,11 +9,11 @@ import pytest
 from flint import arb, fmpq
 
 from noack.core.periods import period_of
+from noack.proof.statement_proof import prove_statement
 from noack_check.balls import matrix, number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop, Times
 from noack_check.model import Edge, Model
-from noack_check.proof import prove
 from noack_check.times import Schedule
 from tests.checker.changes import DOCUMENTS, accepted
 from tests.checker.changes import LOOPS as OTHER_LOOPS
@@ -54,7 +54,7 @@ def test_updates_may_be_on_their_way_for_more_than_a_period() -> None:
     document = proved("periodic_short").document
     assert document["later"] == 1
     with pytest.raises(RejectedError, match="later"):
-        prove(SHORT, {**document, "later": 0})
+        prove_statement(SHORT, {**document, "later": 0})
 
 
 CHANGES: dict[str, Callable[[Loop], Loop]] = {
@@ -88,7 +88,7 @@ def test_a_witness_proves_nothing_about_another_loop(found: Proved, change: str)
     loop, witness = found.loop, found
     other = CHANGES[change](loop)
     with pytest.raises(RejectedError, match=f"^x: {REASONS[change]}"):
-        prove(other, completed(other, witness.document))
+        prove_statement(other, completed(other, witness.document))
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_another_number_of_nodes_is_rejected(found: Proved, pieces: object, reas
     if loop is SHORT and pieces in (1, 2, 3) and pieces is not True:
         pytest.skip("its edges begin and end at the same nodes as with 4")
     with pytest.raises(RejectedError, match=reason):
-        prove(loop, {**witness.document, "pieces": pieces})
+        prove_statement(loop, {**witness.document, "pieces": pieces})
 
 
 def test_the_sensors_error_and_its_assumed_size_are_rejected(found: Proved) -> None:
@@ -113,10 +113,12 @@ def test_the_sensors_error_and_its_assumed_size_are_rejected(found: Proved) -> N
     document: Any = copy.deepcopy(witness.document)
     document["bounds"][0]["output"] = "e_s"
     with pytest.raises(RejectedError, match="e_s"):
-        prove(loop, document)
+        prove_statement(loop, document)
     chain = {"gain": 9.0, "tail": [[3.0, 1.0], [1.0, 2.0]]}
     with pytest.raises(RejectedError, match="errors: of no use"):
-        prove(loop, {**witness.document, "chain": chain, "errors": {"decaying": 1.0, "constant": 0.0}})
+        prove_statement(
+            loop, {**witness.document, "chain": chain, "errors": {"decaying": 1.0, "constant": 0.0}}
+        )
 
 
 def test_a_form_at_another_node_is_rejected(found: Proved) -> None:
@@ -127,7 +129,7 @@ def test_a_form_at_another_node_is_rejected(found: Proved) -> None:
     last = max(int(name.rpartition(" ")[2]) for name in forms if name.startswith("P/0 lost"))
     forms[f"P/0 lost, {last}"] = forms[f"P/0 lost, {last - 1}"]
     with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
-        prove(loop, document)
+        prove_statement(loop, document)
 
 
 # The model.
@@ -209,7 +211,7 @@ WRONG = {
 def test_wrong_periods_are_rejected(name: str) -> None:
     document = {"rate": 0.0, "bounds": []}
     with pytest.raises(RejectedError, match=r"^loop: times: "):
-        prove(EXACT._replace(times=WRONG[name]), document)
+        prove_statement(EXACT._replace(times=WRONG[name]), document)
 
 
 def test_ideal_conditions_have_a_witness() -> None:

@@ -9,6 +9,7 @@ import pytest
 from flint import arb, fmpq
 
 from cosim.simulation.virtual_time import simulate
+from noack.proof.statement_proof import prove_statement
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
@@ -18,7 +19,6 @@ from noack.theory.witnesses.gains import find_by_gains
 from noack.theory.witnesses.outward import proven_bounds
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
-from noack_check.proof import prove
 from noack_check.scenario import read_loop
 from tests.checker.completed import completed
 from tests.checker.loops import SERVO, loop_with, servo
@@ -114,7 +114,7 @@ def test_the_bound_is_none_of_another_reference(
 ) -> None:
     loop = loop_with(changed(key, row, column, factor))
     with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
-        prove(loop, completed(loop, statement.document))
+        prove_statement(loop, completed(loop, statement.document))
 
 
 def test_a_jump_ends_the_statement_before_it() -> None:
@@ -137,7 +137,7 @@ def test_a_jump_ends_the_statement_before_it() -> None:
 def test_the_bound_is_none_of_a_worse_loop(statement: Proved, setting: str, reason: str) -> None:
     loop = loop_with(servo(setting))
     with pytest.raises(RejectedError, match=f"^x: {reason}"):
-        prove(loop, completed(loop, statement.document))
+        prove_statement(loop, completed(loop, statement.document))
 
 
 def test_an_older_input_differs_by_more() -> None:
@@ -150,12 +150,12 @@ def test_a_bound_in_the_limit_is_rejected(statement: Proved) -> None:
     document = copy.deepcopy(statement.document)
     document["bounds"][0]["from_start"] = False
     with pytest.raises(RejectedError, match="no bound in the limit"):
-        prove(loop_with(servo()), document)
+        prove_statement(loop_with(servo()), document)
 
 
 def test_the_offset_of_joined_pieces_is_added(statement: Proved) -> None:
     loop = loop_with(servo())
-    near, far = (prove(loop._replace(offset=arb(size)), statement.document) for size in (0.0, 0.25))
+    near, far = (prove_statement(loop._replace(offset=arb(size)), statement.document) for size in (0.0, 0.25))
     constants = [
         [float(b.constant.mid()) for b in proof.bounds if b.output[0] in "xy"] for proof in (near, far)
     ]
@@ -206,8 +206,8 @@ def test_a_loop_with_an_observer_is_about_its_reference() -> None:
 def test_gains_have_neither_the_input_nor_a_limit_about_a_reference() -> None:
     loop = read_loop(servo(), box=False, ideal=False)._replace(push_before_input=None)
     document: Any = find_by_gains(loop, ("x", "y[0]"))
-    proof = prove(loop, document)
+    proof = prove_statement(loop, document)
     assert {bound.from_start for bound in proof.bounds} == {True}
-    assert not prove(loop._replace(until=None), document).bounds[-1].from_start
+    assert not prove_statement(loop._replace(until=None), document).bounds[-1].from_start
     with pytest.raises(RejectedError, match=r"^u: about a reference"):
-        prove(loop, {**document, "gains": {**document["gains"], "outputs": ["x", "u[0]"]}})
+        prove_statement(loop, {**document, "gains": {**document["gains"], "outputs": ["x", "u[0]"]}})

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
+from noack.proof.statement_proof import prove_statement
 from noack_check.balls import beside, identity, matrix, number, zeros
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop, Times
 from noack_check.model import Model
-from noack_check.proof import prove
 from noack_check.tests_apart import Place, Places
 from tests.checker.changes import DOCUMENTS, accepted
 from tests.checker.changes import LOOPS as OTHER_LOOPS
@@ -112,7 +112,7 @@ def test_a_dwell_time_has_no_test_that_counts() -> None:
 def test_too_many_places_are_rejected() -> None:
     loop = dynamic()._replace(times=Times(T, T, fmpq(1, 5), fmpq(0), fmpq(0)))
     with pytest.raises(RejectedError, match="ways in which updates"):
-        prove(loop, {"rate": 0.0, "later": 8, "bounds": [{"output": "x", "decay": 1.0}]})
+        prove_statement(loop, {"rate": 0.0, "later": 8, "bounds": [{"output": "x", "decay": 1.0}]})
 
 
 def test_each_way_to_the_next_memory_has_an_edge() -> None:
@@ -200,14 +200,14 @@ def test_a_witness_proves_nothing_about_another_loop(name: str, change: str) -> 
     loop, witness = base(name)
     other = CHANGES[change](loop)
     with pytest.raises(RejectedError, match=f"^(x|e_c): ({REASONS[change]})"):
-        prove(other, completed(other, witness.document, whole=True))
+        prove_statement(other, completed(other, witness.document, whole=True))
 
 
 def test_a_longer_dwell_time_and_another_memory_are_rejected() -> None:
     loop, witness = base("dwell")
     longer = loop._replace(times=loop.times._replace(dwell=8 * T))
     with pytest.raises(RejectedError, match=r"^e_c: flow/0 lost, dwells/"):
-        prove(longer, completed(longer, witness.document, whole=True))
+        prove_statement(longer, completed(longer, witness.document, whole=True))
     loop, witness = base("dynamic")
     memory = loop.rule.memory
     assert memory is not None
@@ -218,7 +218,7 @@ def test_a_longer_dwell_time_and_another_memory_are_rejected() -> None:
     ):
         changed = loop._replace(rule=loop.rule._replace(memory=other))
         with pytest.raises(RejectedError, match=reason):
-            prove(changed, completed(changed, witness.document))
+            prove_statement(changed, completed(changed, witness.document))
 
 
 def test_a_negative_coefficient_of_the_memory_is_rejected() -> None:
@@ -230,7 +230,7 @@ def test_a_negative_coefficient_of_the_memory_is_rejected() -> None:
         if name.startswith("eta/"):
             numbers[name] = -abs(numbers[name])
     with pytest.raises(RejectedError, match=r"^x: edge/0 lost, silent"):
-        prove(loop, document)
+        prove_statement(loop, document)
 
 
 def test_the_error_has_no_bound_where_the_model_has_only_its_input() -> None:
@@ -238,7 +238,7 @@ def test_the_error_has_no_bound_where_the_model_has_only_its_input() -> None:
     document: Any = copy.deepcopy(witness.document)
     document["bounds"][0]["output"] = "e_s"
     with pytest.raises(RejectedError, match="e_s"):
-        prove(loop, document)
+        prove_statement(loop, document)
 
 
 def test_a_witness_counts_as_many_tests_as_it_has_forms_for() -> None:
@@ -246,9 +246,9 @@ def test_a_witness_counts_as_many_tests_as_it_has_forms_for() -> None:
     counted: Any = witness.document["counted"]
     for other in (0, counted // 2, counted + 1, 10**6, -1):
         with pytest.raises(RejectedError, match=r"missing|counted"):
-            prove(loop, {**witness.document, "counted": other})
+            prove_statement(loop, {**witness.document, "counted": other})
     with pytest.raises(RejectedError, match="counted"):
-        prove(double_integrator(SCHEDULE), {"rate": 0.0, "counted": 4, "bounds": []})
+        prove_statement(double_integrator(SCHEDULE), {"rate": 0.0, "counted": 4, "bounds": []})
 
 
 def test_the_drift_bounds_no_error_during_a_dwell_time() -> None:
@@ -256,9 +256,9 @@ def test_the_drift_bounds_no_error_during_a_dwell_time() -> None:
     document: Any = copy.deepcopy(witness.document)
     document["bounds"][0]["output"] = "drift"
     with pytest.raises(RejectedError, match=r"^drift: output/0 lost/"):
-        prove(loop, document)
+        prove_statement(loop, document)
     with pytest.raises(RejectedError, match="errors"):
-        prove(loop, {**witness.document, "errors": {"decaying": 1.0, "constant": 1.0}})
+        prove_statement(loop, {**witness.document, "errors": {"decaying": 1.0, "constant": 1.0}})
 
 
 WRONG: dict[str, Callable[[Loop], Loop]] = {
@@ -285,13 +285,13 @@ def test_a_loop_that_is_none_is_rejected(name: str) -> None:
     loop = loop._replace(times=loop.times._replace(sampling=T, least_sampling=T))
     assert loop.fault() == ""
     with pytest.raises(RejectedError, match=r"^loop: "):
-        prove(WRONG[name](loop), {"rate": 0.0, "bounds": []})
+        prove_statement(WRONG[name](loop), {"rate": 0.0, "bounds": []})
 
 
 def test_forms_of_each_test_need_tests_at_exact_times() -> None:
     loop = double_integrator(SCHEDULE._replace(least_sampling=T / 4))
     with pytest.raises(RejectedError, match="by_tests"):
-        prove(loop, {"rate": 0.0, "by_tests": True, "bounds": []})
+        prove_statement(loop, {"rate": 0.0, "by_tests": True, "bounds": []})
 
 
 def of_memory(field: str, factor: float) -> Callable[[Loop, np.random.Generator], Loop]:

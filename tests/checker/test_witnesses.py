@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
+from noack.proof.statement_proof import prove_statement
 from noack_check.balls import is_zero, matrix, number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop, Times
-from noack_check.proof import prove
 from noack_check.sentences import assumptions
 from tests.checker.completed import completed
 from tests.checker.loops import IDEAL, SCHEDULE, bounds_of, changed, double_integrator, holding, relative
@@ -91,7 +91,7 @@ def test_a_witness_proves_nothing_about_another_loop(witness: Proved, change: st
             witness.document if reason.startswith("^rate") else completed(loop, witness.document, signal)
         )
         with pytest.raises(RejectedError, match=reason):
-            prove(loop, document)
+            prove_statement(loop, document)
 
 
 def test_no_number_of_a_witness_may_be_missing_or_negative(witness: Proved) -> None:
@@ -101,7 +101,7 @@ def test_no_number_of_a_witness_may_be_missing_or_negative(witness: Proved) -> N
                 document = copy.deepcopy(witness.document)
                 del document["bounds"][index][table][name]
                 with pytest.raises(RejectedError, match="missing"):
-                    prove(double_integrator(), document)
+                    prove_statement(double_integrator(), document)
 
 
 def test_a_loop_that_holds_updates_has_bounds_by_the_chain() -> None:
@@ -114,7 +114,7 @@ def test_at_rate_0_the_bounds_are_those_of_the_largest_threshold() -> None:
     witness = proved("holding")
     assert not witness.proof.rate > 0
     with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
-        prove(holding(level=0.05), completed(holding(level=0.05), witness.document))
+        prove_statement(holding(level=0.05), completed(holding(level=0.05), witness.document))
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.2])
@@ -126,14 +126,14 @@ def test_a_relative_rule_has_decaying_bounds(sigma: float) -> None:
     assert sizes["e_s"] < 1.25 * sigma
     assert sizes["e_c"] < 6 * sigma
     with pytest.raises(RejectedError, match=r"^x: flow/0 lost/"):
-        prove(relative(1.05 * sigma), witness.document)
+        prove_statement(relative(1.05 * sigma), witness.document)
 
 
 def test_without_a_bound_of_the_drift_tests_say_how_many_events_come_while_an_update_is_on_its_way() -> None:
     witness = proved("relative_tested")
     later = changed(witness.loop, least_sampling=fmpq(1, 200))
     with pytest.raises(RejectedError, match="later: more events"):
-        prove(later, witness.document)
+        prove_statement(later, witness.document)
 
 
 def test_in_the_limit_bounds_are_those_of_disturbances_and_the_floor() -> None:
@@ -155,10 +155,10 @@ def test_an_output_is_bounded_more_tightly_than_by_the_norm_of_the_state() -> No
     assert not [miss for _ in range(3) for miss in exceeded(loop, witness.proof, rng, 8.0)]
     entry = next(e for e in witness.document["bounds"] if e["output"] == "y[1]")
     with pytest.raises(RejectedError, match=r"y\[2\]"):
-        prove(loop, {**witness.document, "bounds": [{**entry, "output": "y[2]"}]})
+        prove_statement(loop, {**witness.document, "bounds": [{**entry, "output": "y[2]"}]})
     larger = loop._replace(outputs=matrix([[1.0, 1.0], [0.0, 3.1]]))
     with pytest.raises(RejectedError, match=r"y\[1\]"):
-        prove(larger, witness.document)
+        prove_statement(larger, witness.document)
 
 
 def test_what_is_assumed_of_events_without_a_least_time_is_said() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from noack.core.progress import Progress, no_progress
 from noack.proof.semidefinite import Accuracy
+from noack.proof.statement_proof import joined, needs_gains, prove_by_gains
 from noack.theory.witnesses.assumptions import (
     first_assumptions,
     first_event_s,
@@ -29,7 +30,7 @@ from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Model
-from noack_check.proof import Bound, Proof, compares_error, conclude, prove, prove_bound, read_assumptions
+from noack_check.proof import Bound, Proof, compares_error, conclude, prove_bound, read_assumptions
 
 _COARSE = Accuracy(gap=1e-3, feasibility=1e-3, improves_steps=False)
 _ATTEMPTS = (
@@ -130,7 +131,7 @@ def witness_by_gains(loop: Loop, outputs: Sequence[str]) -> Witness:
     """
     document = find_by_gains(loop, outputs)
     try:
-        return Witness(document, prove(loop, document))
+        return Witness(document, prove_by_gains(loop, document))
     except RejectedError as error:
         raise NoWitnessError(str(error)) from None
 
@@ -403,19 +404,23 @@ class _OutputSearch:
     def witness(
         self, document: Mapping[str, object], proven: Sequence["_Proven"], wanted: _Wanted
     ) -> Witness:
-        """Return the witness of a document with bounds of this search, and with those by gains.
+        """Return the witness of a document with bounds of this search, and those by gains if they are better.
 
         Raises:
             NoWitnessError: they do not prove what it assumes.
         """
-        with contextlib.suppress(NoWitnessError):
-            gains = find_gains(self._loop, self._rates.rate, wanted.by_gains)
-            document = {**document, "gains": gains}
+        loop = self._loop
         try:
-            proof = conclude(self._loop, document, self._assumed, [each.bound for each in proven])
+            proof = conclude(loop, document, self._assumed, [each.bound for each in proven])
         except RejectedError as error:
             raise NoWitnessError(str(error)) from None
-        return Witness({**document, "bounds": [each.entry for each in proven]}, proof)
+        document = {**document, "bounds": [each.entry for each in proven]}
+        with contextlib.suppress(NoWitnessError, RejectedError):
+            gains = find_gains(loop, self._rates.rate, wanted.by_gains)
+            both = joined(proof, prove_by_gains(loop, {**document, "gains": gains}))
+            if needs_gains(proof, both):
+                return Witness({**document, "gains": gains}, both)
+        return Witness(document, proof)
 
     def _model(self, decay: float) -> Model:
         assumed = self._assumed

@@ -1,6 +1,6 @@
 """The search for a witness by gains: Lyapunov functions at a rate, and coordinates of the inputs.
 
-Nothing here has to be right: :mod:`noack_check.gains` solves the inequalities and verifies the solution.
+Nothing here has to be right: ``noack_gains`` solves the inequalities and verifies the solution.
 """
 
 from collections.abc import Iterator, Sequence
@@ -9,16 +9,17 @@ from contextlib import suppress
 import numpy as np
 
 from noack.core.linear_systems import Matrix
+from noack.proof.forms_proof import as_text
+from noack.proof.gains_document import gains_document, proof_text
+from noack.proof.loop_document import Naming, NoDocumentError
 from noack.theory.response_bounds import NotDecayingError, lyapunov_decay
 from noack.theory.witnesses.assumptions import before_due, observer_decay
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError
-from noack_check.apart import share_of_threshold
 from noack_check.balls import number
-from noack_check.check import RejectedError
-from noack_check.gains import Gains, own_comparison
 from noack_check.loop import Loop
 from noack_check.proof import compares_error
+from noack_gains import Document, Gains, RejectedError, read_proof, share_of_threshold
 
 _SHARES = (1.0, 0.5, 0.2, 0.0)
 """Rates that are tried, in multiples of the largest one."""
@@ -46,7 +47,7 @@ def find_gains(loop: Loop, rate: float, outputs: Sequence[str]) -> dict[str, obj
         except NoWitnessError as error:
             reason = error
             continue
-        decaying, constant = gains.bounds[outputs[0]]
+        decaying, constant = next(iter(gains.bounds.values()))
         found.append((float(decaying + constant), table))
     if not found:
         raise reason
@@ -84,12 +85,14 @@ def _gains(
     }
     if loop.losses and not is_periodic and (rate or not loop.holds):
         table["model"] = _lyapunov(floats(loop.H), rate, "the model")
-    if not is_periodic and own_comparison(loop) is None:
-        table["comparison"] = _comparison(loop)
     try:
-        gains = Gains(loop, number(rate), table)
-    except RejectedError as error:
-        raise NoWitnessError(str(error)) from None
+        text = as_text(gains_document(loop, rate, [*outputs], Naming("loop"))[0])
+        document = Document(text)
+        if not is_periodic and not document.compares_error:
+            table["comparison"] = _comparison(loop)
+        gains = Gains(document, read_proof(document, proof_text(text, table)))
+    except (RejectedError, NoDocumentError) as error:
+        raise NoWitnessError(f"gains: {error}") from None
     if compares_error(loop):
         table["inter_event_s"] = min(_inter_event_s(gains), before_due(loop))
     return table, gains

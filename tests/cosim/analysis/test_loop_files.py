@@ -114,15 +114,28 @@ def test_the_document_in_words_has_all_that_is_in_the_file(files: tuple[Path, Pa
             "there is no loop document: a rule with a dynamic variable",
         ),
         (("check", "lane_acknowledged", "--document"), "there is no proof: "),
-        (
-            ("check", "lane_5g_urban", "--document"),
-            "there is no loop document: the bounds are small-gain bounds",
-        ),
     ],
 )
 def test_what_has_no_document_is_said_in_one_line(words: tuple[str, ...], line: str) -> None:
     result = invoke(*words)
     assert (result.exit_code, line in result.stderr) == (ExitStatus.CALLER, True), result.stderr
+
+
+def test_noack_check_proves_bounds_by_gains(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a loop that has no forms the second verifier reads both files."""
+    loop, proof = tmp_path / "loop.json", tmp_path / "proof.json"
+    result = invoke("certify", "lane_5g_urban", "--no-search", "--document", loop, "--proof", proof)
+    assert result.exit_code == ExitStatus.OK, result.output
+    status, output = noack_check(capsys, loop, proof)
+    assert status == ExitStatus.OK
+    assert "PROVED |lateral offset| ≤ 222.541 e^(−0.25 t) m at all times" in output
+    assert "where an update that is not lost acts within 144 ms; the first input within 144 ms" in output
+    assert "by small gains, which" in output
+    words = invoke("check", "lane_5g_urban", "--document").output
+    assert "at most 0 updates in a row are lost" in words
+    assert json.loads(invoke("check", "lane_5g_urban", "--document", "--json").output)["losses"] == 0
+    loop.write_text(loop.read_text().replace('"losses":0', '"losses":1'))
+    assert noack_check(capsys, loop, proof) == (1, f"REJECTED {OF_ANOTHER}\n")
 
 
 def test_each_shipped_proof_has_its_file() -> None:

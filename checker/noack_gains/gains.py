@@ -63,38 +63,46 @@ they do not: see :mod:`.proof`.
 """
 
 import math
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
-from flint import arb, arb_mat, fmpq
+from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from noack_check.balls import (
+from noack_gains.balls import (
     beside,
     between,
     columns_of,
     identity,
     is_positive,
     is_zero,
+    norm_of,
     rows_of,
     square,
+    upper,
     zeros,
 )
-from noack_check.check import RejectedError
-from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
-from noack_check.loop import Loop, Rule
-from noack_check.model import thresholds
-from noack_check.noise import noise_of
-from noack_check.responses import (
+from noack_gains.document import Document, Loop, Output, Rule
+from noack_gains.reading import (
+    Matrix,
+    RejectedError,
+    Table,
+    exact_matrix,
+    fields,
+    mapping,
+    rational,
+    read_matrix,
+    truth,
+    whole,
+)
+from noack_gains.responses import (
     Decay,
     EnclosedResponses,
     Question,
     Response,
     enclose,
-    norm_of,
     responses,
     responses_until,
-    upper,
 )
 
 Form = Mapping[str, arb]
@@ -151,109 +159,99 @@ class Source(NamedTuple):
     is_outside: bool = False  # acts before the first input, too, beside p
 
 
-def units_of(loop: Loop, rate: arb) -> list[Unit]:
+def units_of(loop: Loop) -> list[Unit]:
     """Return the units of a loop's bounds."""
-    (level, floor), (decaying, constant) = thresholds(loop, rate), noise_of(loop, rate).sizes
-    has_decaying, found = loop.has_decaying_unit(rate), []
-    if has_decaying:
-        found.append(Unit(rate, True, False, level, decaying))
+    level, floor = arb(loop.rule.level), arb(loop.rule.floor)
+    decaying, constant = loop.noise
+    if not loop.has_decaying_unit:  # the threshold is at most the constant max(c, f)
+        return [Unit(arb(0), True, True, level.max(floor), decaying + constant)]
+    found = [Unit(arb(loop.rate), True, False, level, decaying)]
     if loop.needs_constant:
-        found.append(Unit(arb(0), not has_decaying, True, floor, constant))
+        found.append(Unit(arb(0), False, True, floor, constant))
     return found
 
 
-def single_unit(loop: Loop, rate: arb) -> Unit | None:
+def single_unit(loop: Loop) -> Unit | None:
     """Return the unit max(f₁, f/c) of a threshold max(c f₁, f), or f₂ if c is 0, of all that acts.
 
     None: there is only one unit, or no constant threshold.
     """
-    (level, floor), (decaying, constant) = thresholds(loop, rate), noise_of(loop, rate).sizes
-    if not (loop.has_decaying_unit(rate) and loop.needs_constant and floor > 0):
+    rule, (decaying, constant) = loop.rule, loop.noise
+    if not (loop.has_decaying_unit and loop.needs_constant and rule.floor > 0):
         return None
-    if level > 0 and bool(rate == loop.rule.rate):
-        scale = level / floor
-        return Unit(rate, True, True, level, decaying + scale * constant, scale)
-    return Unit(arb(0), True, True, level.max(floor), decaying + constant)
+    if rule.level > 0 and loop.rate == rule.rate:
+        scale = arb(rule.level) / arb(rule.floor)
+        return Unit(arb(loop.rate), True, True, arb(rule.level), decaying + scale * constant, scale)
+    return Unit(arb(0), True, True, arb(max(rule.level, rule.floor)), decaying + constant)
 
 
-def read_witness(loop: Loop, table: Mapping[str, object]) -> Witness:
-    """Return what a document's table "gains" names."""
+def read_witness(document: Document, loop: Loop, table: Table) -> Witness:
+    """Return what a proof names of a loop, which may be one with the rule that :func:`_followed` takes."""
+    n, m = document.n, document.m
     decays = {}
     for name in ("plant", "model"):
-        if name == "plant" or name in table:
-            entry = read_table(table, name)
-            decays[name] = Decay(read_matrix(entry, "form", loop.n), read_number(entry, "decay"))
-    T = read_rows(table, "inputs")
-    if (T.nrows(), T.ncols()) != (loop.B.ncols(),) * 2:
-        raise RejectedError("gains: inputs: not a square matrix of the right size")
-    return Witness(decays["plant"], decays.get("model"), T, _comparison(loop, table))
+        if table.get(name) is not None or name == "plant":
+            entry = mapping(table.get(name), name)
+            fields(entry, name, ("form", "decay"))
+            form = exact_matrix(entry["form"], f"form of the {name}", n, n)
+            if form.mid != form.mid.transpose():
+                raise RejectedError(f"form of the {name}: not symmetric")
+            decays[name] = Decay(form.balls, arb(rational(entry["decay"], name)))
+    T = exact_matrix(table["inputs"], "inputs", m, m).balls
+    return Witness(decays["plant"], decays.get("model"), T, _comparison(document, loop, table))
 
 
-def require_covered(loop: Loop) -> None:
-    """Raise RejectedError if the argument does not cover a loop: its rule, or unknown loads."""
-    rule = loop.rule
-    if loop.loads or rule.memory is not None or rule.of_input:
-        raise RejectedError("gains: not with loads, nor a rule with a memory or of the input")
-
-
-def own_comparison(loop: Loop) -> Comparison | None:
-    """Return what a silent test says if the rule compares ‖W e_s‖ with a threshold, and with x; else None."""
-    n, rule = loop.n, loop.rule
-    states, errors = range(n), range(n, 2 * n)
-    compares = rule.positive.nrows() == n and is_zero(columns_of(rule.positive, states))
-    compares = compares and is_zero(columns_of(rule.positive, errors) - loop.weight)
-    if not compares or (rule.negative.nrows() and not is_zero(columns_of(rule.negative, errors))):
-        return None
-    share = columns_of(rule.negative, states) if rule.negative.nrows() else zeros(0, n)
-    return Comparison(loop.weight, zeros(n, n), share)
-
-
-def _comparison(loop: Loop, table: Mapping[str, object]) -> Comparison | None:
-    """Return what a silent test says, as proven: of some rules with what a document's table names."""
+def _comparison(document: Document, loop: Loop, table: Table) -> Comparison | None:
+    """Return what a silent test says, as proven: of some rules with what a proof names."""
     n, rule = loop.n, loop.rule
     if loop.times.period > 0:
         return None
-    if (own := own_comparison(loop)) is not None:
-        return own
-    if "comparison" not in table:
-        raise RejectedError("gains: the rule does not compare ‖W e_s‖: a comparison is needed")
-    entry = read_table(table, "comparison")
-    found = Comparison(*(read_rows(entry, name) for name in Comparison._fields))
-    shapes = [(M.nrows(), M.ncols()) for M in found]
-    if shapes[:2] != [(n, n)] * 2 or shapes[2][1] != n:
-        raise RejectedError("gains: comparison: matrices of another size")
-    Q = square(rule.positive) - square(rule.negative) if rule.negative.nrows() else square(rule.positive)
+    if loop.compares_error:
+        share = columns_of(rule.negative.balls, range(n)) if rule.negative.shape[0] else zeros(0, n)
+        return Comparison(loop.weight, zeros(n, n), share)
+    if table.get("comparison") is None:
+        raise RejectedError("comparison: the rule does not compare ‖W e_s‖, so one is needed")
+    entry = mapping(table["comparison"], "comparison")
+    fields(entry, "comparison", Comparison._fields)
+    found = Comparison(
+        exact_matrix(entry["errors"], "comparison: errors", n, n).balls,
+        exact_matrix(entry["shift"], "comparison: shift", n, n).balls,
+        read_matrix(entry["share"], "comparison: share", None, n).balls,
+    )
+    Q = square(rule.positive.balls)
+    if rule.negative.shape[0]:
+        Q -= square(rule.negative.balls)
     Q += square(beside(found.share, zeros(found.share.nrows(), n)))
     if not is_positive(Q - square(found.errors * beside(found.shift, identity(n)))):
-        raise RejectedError("gains: comparison: a silent test does not say as much")
+        raise RejectedError("comparison: a silent test does not say as much")
     return found
 
 
-def _followed(loop: Loop, table: Mapping[str, object]) -> Loop:
-    """Return the loop with the rule for which that of a loop is taken, as a document's table says."""
+def _followed(loop: Loop, table: Table) -> Loop:
+    """Return the loop with the rule for which that of a loop is taken, as a proof says."""
     n, rule, times = loop.n, loop.rule, loop.times
-    if table.get("by_time", False):
+    if truth(table.get("by_time", False), "by_time"):
         if not times.longest > 0:
-            raise RejectedError("gains: by_time: the rule has no largest time between events")
-        none = zeros(0, 2 * n)
+            raise RejectedError("by_time: the rule has no largest time between events")
+        none, zero = Matrix(fmpq_mat(0, 2 * n)), fmpq(0)
         least = max(times.least_apart, min(times.longest, fmpq(1, 10**9)))
         return loop._replace(
-            rule=Rule(none, none, arb(0), arb(0), arb(0)),
+            rule=Rule(none, none, zero, zero, zero, False, False),
             times=times._replace(
-                least_period=min(least, times.longest), period=times.longest, dwell=fmpq(0), longest=fmpq(0)
+                least_period=min(least, times.longest), period=times.longest, dwell=zero, longest=zero
             ),
         )
     if not rule.integrates:
         return loop
     if times.sampling > 0:
-        tests = read_count(table, "tests", _MOST_TESTS)
+        tests = whole(table.get("tests"), "tests", _MOST_TESTS)
         least, window = tests * times.least_sampling, (tests + 1) * times.sampling
     else:
-        least = window = read_number(table, "window_s").fmpq()
+        least = window = rational(table.get("window_s"), "window_s")
     if not least > 0:
-        raise RejectedError("gains: tests or window_s: not above 0")
+        raise RejectedError("tests or window_s: not above 0")
     return loop._replace(
-        rule=rule._replace(floor=rule.floor / arb(least), integrates=False),
+        rule=rule._replace(floor=rule.floor / least, integrates=False),
         times=times._replace(sampling=window, least_sampling=fmpq(0)),
     )
 
@@ -265,13 +263,13 @@ class _Responses:
         loop: the loop.
         rate: what is added to A + BK, H and A.
         witness: what the document names.
-        wanted: the outputs to bound.
+        outputs: rows C of the outputs to bound, by their names.
 
     Raises:
         RejectedError: a response is not enclosed.
     """
 
-    def __init__(self, loop: Loop, rate: arb, witness: Witness, wanted: Container[str]) -> None:
+    def __init__(self, loop: Loop, rate: arb, witness: Witness, outputs: Mapping[str, arb_mat]) -> None:
         self.loop, self.witness = loop, witness
         n, m, times, one = loop.n, loop.B.ncols(), loop.times, identity(loop.n)
         self.compared = witness.comparison or Comparison(loop.weight, zeros(n, n), zeros(0, n))
@@ -280,37 +278,30 @@ class _Responses:
                 M.inv() for M in (witness.inputs, loop.weight, self.compared.errors)
             )
         except ZeroDivisionError:
-            raise RejectedError("gains: weight, inputs or errors: not proven to have an inverse") from None
+            raise RejectedError("weight, inputs or errors: not proven to have an inverse") from None
         self.gain, H, closed = witness.inputs * loop.gain, loop.H, loop.A + loop.B * loop.gain
         K, is_periodic = self.gain, times.period > 0
         self.untested = arb(times.period if is_periodic else max(times.sampling, times.dwell))
         self.lost = 0 if is_periodic else loop.losses
         recent = self.untested * (1 + loop.losses if is_periodic else 1) + arb(times.delay)
-        halves = zip(loop.half_A.tolist(), loop.half_B.tolist(), strict=True)
-        self.boxed = [i for i, rows in enumerate(halves) if any(entry != 0 for row in rows for entry in row)]
-        mismatch = closed - H
-        self.mismatched = [i for i in range(n) if not is_zero(rows_of(mismatch, [i]))]
+        mismatch, self.boxed, self.mismatched = closed - H, loop.boxed, loop.mismatched
         self.driving, first = self._driving(), m + len(self.boxed)
         self.of_mismatch = range(first, first + len(self.mismatched))
 
         # The state.
         self.aged = K * (-1 * between(-arb(times.lead), arb(times.age)) * H).exp()
         share, shift = self.compared.share, loop.weight * self.compared.shift
-        entries = {f"x[{i}]": rows_of(one, [i]) for i in range(n)}
-        entries |= {f"y[{i}]": rows_of(loop.output_rows, [i]) for i in range(loop.output_rows.nrows())}
-        outputs = {"x": one, "share": share, "shift": shift}
-        outputs |= {
-            name: row for name, row in entries.items() if name in wanted or (self.boxed and name[0] == "x")
-        }
-        outputs |= {f"Kx {j}": rows_of(loop.gain, [j]) for j in range(m)}
-        outputs |= {f"Ex {i}": rows_of(mismatch, [i]) for i in self.mismatched}
-        outputs |= {"WEx": loop.weight * mismatch} if self.mismatched else {}
+        found_rows = {"share": share, "shift": shift, **outputs}
+        found_rows |= {f"x[{i}]": rows_of(one, [i]) for i in range(n) if self.boxed}
+        found_rows |= {f"Kx {j}": rows_of(loop.gain, [j]) for j in range(m)}
+        found_rows |= {f"Ex {i}": rows_of(mismatch, [i]) for i in self.mismatched}
+        found_rows |= {"WEx": loop.weight * mismatch} if self.mismatched else {}
         if times.from_tick > 0:
-            outputs |= {f"aged {j}": rows_of(K, [j]) * H for j in range(m)}
-            outputs |= {f"bent {j}": rows_of(self.aged, [j]) * H * H for j in range(m)}
+            found_rows |= {f"aged {j}": rows_of(K, [j]) * H for j in range(m)}
+            found_rows |= {f"bent {j}": rows_of(self.aged, [j]) * H * H for j in range(m)}
         columns = [*self.driving, loop.start]
-        found = responses(closed + rate * one, witness.plant, list(outputs.values()), columns)
-        self.states = dict(zip(outputs, found, strict=True))
+        found = responses(closed + rate * one, witness.plant, list(found_rows.values()), columns)
+        self.states = dict(zip(found_rows, found, strict=True))
         self.before = responses_until(
             loop.A + rate * one, arb(times.start), [rows_of(K, [j]) for j in range(m)], columns
         )
@@ -319,7 +310,7 @@ class _Responses:
         self.scaled_H = H + rate * one
         errors = {"W": loop.weight} | {f"p {j}": rows_of(self.aged, [j]) for j in range(m)}
         self._errors = errors
-        self.is_own = is_zero(self.compared.errors - loop.weight)
+        self.is_own = witness.comparison is None or loop.compares_error
         self.columns = [self.inverse]
         if witness.comparison is not None and not self.is_own:
             self.columns.append(of_compared)
@@ -331,7 +322,7 @@ class _Responses:
         self._ever: EnclosedResponses | None = None
         if self.lost and not is_zero(self.scaled_H):
             if witness.model is None:
-                raise RejectedError("gains: model: missing")
+                raise RejectedError("model: missing")
             question = Question(self.scaled_H, witness.model, list(errors.values()), self.columns)
             self._ever = enclose(question, _REST)
         self.ever = self._from(arb(0)) if self.lost else {}
@@ -343,7 +334,7 @@ class _Responses:
         found = [columns_of(B, [j]) for j in range(B.ncols())]
         found += [columns_of(one, [i]) for i in (*self.boxed, *self.mismatched)]
         found += [columns_of(loop.pushes, [i]) for i in range(loop.pushes.ncols())]
-        return found if loop.push_before_input is None else [*found, loop.push_before_input]
+        return found if loop.before_input is None else [*found, loop.before_input]
 
     def growth(self, until: arb) -> list[Response]:
         """Return the growth of W e_s within a time, from W⁻¹ and by each source."""
@@ -405,7 +396,7 @@ class UnitGains:
         for size in loop.sizes:
             amplitude = {"1": size * unit.of_constant} if unit.has_constants else {}
             yield Source(amplitude, amplitude, {}, is_outside=True)
-        if loop.push_before_input is not None:  # it acts up to t_a, where f₁ has fallen
+        if loop.before_input is not None:  # it acts up to t_a, where f₁ has fallen
             early = {"1": (arb(loop.times.start) * unit.rate).exp()} if unit.has_start else {}
             yield Source({}, {}, early, is_outside=True)
 
@@ -594,9 +585,9 @@ def _unbounded(rows: Mapping[str, Form]) -> RejectedError:
             break
         y = {name: value / radius for name, value in following.items()}
     if not 1 <= radius < math.inf:
-        return RejectedError("gains: the inequalities between the suprema are not solved")
+        return RejectedError("the inequalities between the suprema are not solved")
     return RejectedError(
-        "gains: what losses and delays add to an error comes back through the loop "
+        "what losses and delays add to an error comes back through the loop "
         f"{radius:.4g} times as large; a proof needs less than 1"
     )
 
@@ -605,60 +596,55 @@ class Gains:
     """What is proven by gains.
 
     Args:
-        loop: the loop.
-        rate: r.
-        table: the table "gains" of a document.
+        document: of the loop.
+        table: a proof's numbers.
 
     Raises:
         RejectedError: it is not proven.
     """
 
-    def __init__(self, loop: Loop, rate: arb, table: Mapping[str, object]) -> None:
-        loop = _followed(loop, table)
-        require_covered(loop)
-        witness = read_witness(loop, table)
-        self.loop, self.rate, self._witness = loop, rate, witness
-        witness.plant.require(loop.A + loop.B * loop.gain + rate * identity(loop.n), "gains: plant")
+    def __init__(self, document: Document, table: Table) -> None:
+        self.document, self.rule = document, document.rule
+        self.loop = loop = _followed(document.loop, table)
+        self._witness = witness = read_witness(document, loop, table)
+        shift = arb(loop.rate) * identity(loop.n)
+        witness.plant.require(loop.A + loop.B * loop.gain + shift, "plant")
         if witness.model is not None:
-            witness.model.require(loop.H + rate * identity(loop.n), "gains: model")
-        counts = {"x": loop.n, "u": loop.B.ncols(), "y": loop.output_rows.nrows()}
-        entries = {f"{kind}[{i}]" for kind, count in counts.items() for i in range(count)}
-        outputs = table.get("outputs")
-        if not isinstance(outputs, list):
-            raise RejectedError("gains: outputs: not a list")
-        if unknown := {*map(str, outputs)} - entries - {"x", "e_s", "e_c"}:
-            raise RejectedError(f"gains: outputs: {min(unknown)[:50]!r} is none of the loop's")
-        self._outputs = [*map(str, outputs)]
+            witness.model.require(loop.H + shift, "model")
+        self._rows = {
+            f"output {output.name}": output.rows.balls
+            for output in document.outputs
+            if output.rows is not None
+        }
         self._responses: dict[bool, _Responses] = {}
         self.units: list[UnitGains] = []
-        for unit in reversed(units_of(loop, rate)):
+        for unit in reversed(units_of(loop)):
             self.units.append(self._gains(unit, *self.units))
-        self.bounds = {output: self._bound(output) for output in self._outputs}
-        """D₁ and D₂ of each output that the document names."""
+        self.bounds = {output.name: self._bound(output) for output in document.outputs}
+        """D₁ and D₂ of each output of the document, of x about where the loop has it."""
 
-    def _bound(self, output: str) -> tuple[arb, arb]:
+    def _bound(self, output: Output) -> tuple[arb, arb]:
         found = {True: arb(0), False: arb(0)}
         for gains in self.units:
-            index = int(output[2:-1]) if output.endswith("]") else 0
-            if output == "e_s":
-                form = gains.sensor_error()
-            elif output == "e_c":
-                form = gains.error("W")
+            if output.rows is not None:
+                form = gains.state(f"output {output.name}")
+            elif output.input is not None:
+                form = gains.input(output.input)
             else:
-                form = gains.input(index) if output.startswith("u[") else gains.state(output)
+                form = gains.sensor_error() if output.error == "sensor" else gains.error("W")
             found[gains.unit.has_constants] = value(form, gains.sups)
         return found[False], found[True]
 
     def _gains(self, unit: Unit, *constant: UnitGains) -> UnitGains:
         key = bool(unit.rate > 0)
         if key not in self._responses:
-            self._responses[key] = _Responses(self.loop, unit.rate, self._witness, self._outputs)
+            self._responses[key] = _Responses(self.loop, unit.rate, self._witness, self._rows)
         return UnitGains(self._responses[key], unit, *constant)
 
     @cached_property
     def single(self) -> UnitGains | None:
         """The inequalities in one unit instead of two, as :mod:`.apart` needs them; None: there are none."""
-        unit = single_unit(self.loop, self.rate)
+        unit = single_unit(self.loop)
         try:
             return None if unit is None else self._gains(unit)
         except RejectedError:

@@ -8,11 +8,19 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat
 
-from noack_check.balls import beside, columns_of, frobenius, identity, is_positive, is_zero, transpose, upto
-from noack_check.check import RejectedError
-from noack_check.norms import spectral_norm
+from noack_gains.balls import (
+    beside,
+    columns_of,
+    identity,
+    is_positive,
+    norm_of,
+    spectral_norm,
+    transpose,
+    upper,
+    upto,
+)
+from noack_gains.reading import RejectedError
 
-_SQUARINGS = 8
 _CELLS, _MOST_CELLS = 48, 6000
 _KEPT = 32
 """A state is computed from the start after so many steps: balls grow."""
@@ -231,18 +239,6 @@ def responses_until(
         [Response(upper(a), upper(b)) for a, b in zip(*rows, strict=True)]
         for rows in zip(most, totals, strict=True)
     ]
-
-
-def norm_of(M: arb_mat) -> arb:
-    """Return an upper bound of ‖M‖₂."""
-    if is_zero(M):
-        return arb(0)
-    return frobenius(M) if min(M.nrows(), M.ncols()) == 1 else spectral_norm(M, _SQUARINGS)
-
-
-def upper(value: arb) -> arb:
-    """Return an exact number that is at least a value which is not negative."""
-    return arb(value.abs_upper())
 
 
 def _norms(outputs: Sequence[arb_mat], Z: arb_mat, parts: Sequence[range]) -> list[list[arb]]:

@@ -36,9 +36,8 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat
 
-from noack_check.balls import beside, rows_of, square, upto
-from noack_check.gains import Gains, UnitGains
-from noack_check.responses import norm_of, upper
+from noack_gains.balls import beside, norm_of, rows_of, square, upper, upto
+from noack_gains.gains import Gains, UnitGains
 
 _CELLS = 48
 
@@ -65,8 +64,8 @@ def share_of_threshold(gains: Gains, time: arb) -> arb:
 
     It is infinite if none is known. The rule compares ‖W e_s‖.
     """
-    rule, rate = gains.loop.rule, gains.rate
-    level, floor = rule.level if bool(rate == rule.rate) else arb(0), rule.floor
+    rule, rate = gains.loop.rule, gains.loop.rate
+    level, floor = arb(rule.level if rate == rule.rate else 0), arb(rule.floor)
     share = arb("inf")
     if gains.single is not None:
         share = share.min(reached(gains.single, time) / (level if level > 0 else floor))
