@@ -20,17 +20,7 @@ from noack_check.check import RejectedError
 from noack_check.files import UnreadableError, read_json, read_text, read_toml
 from noack_check.growth import prove_growth, read_periodic_loop
 from noack_check.keys import RefusedError, Table
-from noack_check.proof import prove
-from noack_check.scenario import output_names, read_enclosed, read_loop
-from noack_check.sentences import (
-    assumptions,
-    digest_of_equations,
-    equations_text,
-    growth_sentences,
-    meaning,
-    quoted,
-    sentences,
-)
+from noack_check.sentences import growth_sentences, quoted
 from noack_verify import verify
 
 _PLANTS = {
@@ -159,23 +149,9 @@ def check_file(file: Table, given: Table | None, equations: str | None = None) -
             growth = prove_growth(read_periodic_loop(scenario), document)
             yield from (f"PROVED {of}, nothing late: {sentence}" for sentence in growth_sentences(growth))
             continue
-        if "bounds" not in document and "gains" in document:
-            raise RejectedError(
-                "a statement by gains has a document of its own: `noack certify NAME --document D --proof P`"
-            )
-        enclosed = read_enclosed(scenario, document) if plants == "region" else None
-        loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal", enclosed=enclosed)
-        if enclosed is not None:
-            digest = digest_of_equations(document, equations)
-            of = f"{quoted(name)}, {_PLANTS[plants]} {digest[:_SHORT_DIGEST]}, {_CONDITIONS[conditions]}"
-        for sentence in sentences(prove(loop, document), output_names(scenario)):
-            yield f"PROVED {of}: {sentence}"
-        if meant := meaning(scenario, loop):
-            yield f"       where {meant}"
-        yield f"       if there are {assumptions(scenario, loop)}"
-        if enclosed is not None:
-            rates = equations_text(document)
-            yield f"       and the plant has the equations with the SHA-256 {digest}: {rates}"
+        raise RejectedError(
+            "bounds have a document and a proof of their own: `noack certify NAME --document D --proof P`"
+        )
 
 
 def _differences(given: Table, scenario: Table) -> list[str]:

@@ -150,28 +150,11 @@ class Edge(NamedTuple):
     """Symmetric Q: y² becomes zᵀQz; None: it stays."""
 
 
-class Chain(NamedTuple):
-    """The paper's chain: w = Σ e^{H(t − t_i)} e_s(t_i⁻) over the updates that the acting input lacks."""
-
-    gain: arb
-    """At least sup ‖W e^{(H + r)s} W⁻¹‖ over all s ≥ 0."""
-    recent: arb
-    """The same over 0 ≤ s ≤ d."""
-
-    def factor(self, lost: int, sent: int) -> arb:
-        """Return a bound of ‖W w‖ in multiples of that of ‖W e_s‖.
-
-        It is for so many lost updates, and so many whose events are at most d ago.
-        """
-        return self.gain * lost + self.recent * sent
-
-
 class Errors(NamedTuple):
-    """What is assumed at all times: (‖W e_s‖ + ‖W n‖)² ≤ ``decaying``² f₁² + ``constant``² f₂²."""
+    """What is assumed at all times: ‖W e_s‖² ≤ ``decaying``² f₁² + ``constant``² f₂²."""
 
     decaying: arb
     constant: arb
-    chain: Chain
 
 
 class Part(NamedTuple):
@@ -217,7 +200,8 @@ class Model:
         loop: the loop.
         rate: r ≥ 0 in f₁ = e^{−rt}, in 1/s.
         decay: ν in dV/dt ≤ −νV, in 1/s.
-        errors: what is assumed of e_s, if it is used: then w is bounded by the paper's chain, too.
+        errors: what is assumed of e_s, if it is used. With a held input H = 0, so w does not move and is then
+            bounded, too: by as many times as much as updates are missing.
         noise: bounds of n; by default those without an observer.
         later: most events within d after an event.
         later_at_start: most events after the one at t = 0 before the first input acts.
@@ -359,11 +343,11 @@ class Model:
             tested = (arb(0),)  # an input may act at any time after a test, and leaves all c as they are
         found = []
         for lost in range(losses + 1):
-            facts = assumed + (self._chain(lost, 0) if lost else ())
+            facts = assumed + (self._missing(lost) if lost else ())
             coordinates = self._coordinates(lost > 0 and not self.is_periodic, 0)
             found.append(Location(f"{lost} lost", coordinates, tested, flows, facts, silent, True))
         for later in range(self._waiting):
-            facts, nodes = self._chain(losses, later + 1), self._time_to(times.delay, later)
+            facts, nodes = self._missing(losses + later + 1), self._time_to(times.delay, later)
             facts += self._assumed()
             name, coordinates = f"{later} later", self._coordinates(True, later)
             found.append(Location(name, coordinates, nodes, flows, facts, (), False))
@@ -438,9 +422,9 @@ class Model:
         """Return ‖W e_s‖² minus its bound, if one is assumed."""
         return self.at_most(self.e, arb(1))
 
-    def _chain(self, lost: int, sent: int) -> tuple[arb_mat, ...]:
-        """Return ‖W w‖² minus its bound by the chain, if that is known."""
-        return self.at_most(self.w, self.errors.chain.factor(lost, sent)) if self.errors else ()
+    def _missing(self, updates: int) -> tuple[arb_mat, ...]:
+        """Return ‖W w‖² minus its bound with some missing updates, if the input is held: w does not move."""
+        return self.at_most(self.w, arb(updates)) if self.loop.holds else ()
 
     def at_most(self, error: arb_mat, factor: arb) -> tuple[arb_mat, ...]:
         """Return ‖W error‖² minus a multiple of what is assumed of ‖W e_s‖², if that is."""

@@ -205,6 +205,8 @@ def identity(size: int) -> fmpq_mat:
 
 def growth(G: arb_mat, until: arb) -> tuple[arb, arb]:
     """Return upper bounds of sup ‖e^{Gs}‖ and of ∫ ‖e^{Gs}‖ ds over 0 ≤ s ≤ ``until``."""
+    if all(entry == 0 for entry in G.entries()):
+        return arb(1), until
     largest, total, step = arb(1), arb(0), until / _CELLS
     half = (step / 2).upper()  # a cell is within [0, 2 half]
     within, forward = (G * arb(half, half)).exp(), (G * step).exp()

@@ -15,6 +15,7 @@ inequality that is affine in θ, such a number m is one number on each piece of 
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
+from typing import Protocol
 
 from flint import fmpq
 
@@ -44,6 +45,13 @@ from noack_kernel.exact import (
     whole,
     zeros,
 )
+
+
+class KnownFacts(Protocol):
+    """Facts of a document, and what is proven beside them."""
+
+    def of_facts(self, name: str, table: Table, facts: Sequence[str], location: str, z: Matrix) -> Matrix:
+        """Return Σ m q(z) with the multipliers of a table, for what holds in a location or at its edges."""
 
 
 class Forms:
@@ -82,6 +90,7 @@ class Forms:
             self._read_form(location, mapping(table[location.name], "forms"))
         self._used: set[str] = set()
         self._others: Mapping[str, Forms] = {}
+        self._rows: KnownFacts | None = None
         self.never: set[str] = set()
         """Edges with ``to: null`` that :meth:`verify` has proven to be never taken."""
 
@@ -136,16 +145,17 @@ class Forms:
 
     # The rules.
 
-    def verify(self, others: Mapping[str, "Forms"]) -> int:
+    def verify(self, others: Mapping[str, "Forms"], rows: KnownFacts) -> int:
         """Verify all inequalities, and return how many.
 
         Args:
             others: forms that may be used, by their names: those that have R3 and are verified, too.
+            rows: sums facts, and bounds of rows that are verified, too (R11).
 
         Raises:
             RejectedError: the first that is not proven, or multipliers that belong to none.
         """
-        self._others = others
+        self._others, self._rows = others, rows
         count = 0
         for name, M in self._inequalities():
             if not is_positive(M):
@@ -164,7 +174,7 @@ class Forms:
         for edge in self._document.edges:
             if edge.target is not None:
                 yield from self._of_edge(edge)
-            elif any(self._above(edge, node) for node in self._times(edge)):
+            elif any(self._above(edge, node) for node in self.times(edge)):
                 yield from self._of_dead_edge(edge)
         if self.starts:
             yield self._of_start()
@@ -192,7 +202,7 @@ class Forms:
                 P = forms[end]
                 M = product(P @ z, corner.velocity) + padded(slope + P.times(decay), signals)
                 M = M.times(fmpq(-1)) + padded(self._forms(table, location, end, fmpq(0)), signals)
-                M = self._with_facts(name, M, location.facts, z, corner)
+                M = self._with_facts(name, M, location.facts, location.name, z, corner)
                 yield name, self._within(location, M)
 
     def _of_edge(self, edge: Edge) -> Iterator[tuple[str, Matrix]]:
@@ -202,8 +212,11 @@ class Forms:
         for node, other in self._pairs(edge):
             name = f"edge/{edge.name}/{node} {other}"
             after = edge.jump.T @ self.P[str(edge.target)][other] @ edge.jump
-            for before in self._before(f"edge/{edge.name}", source, self._times(edge), node):
-                yield name, self._within(source, self._with_facts(name, before - after, facts, z, None))
+            for before in self._before(f"edge/{edge.name}", source, self.times(edge), node):
+                yield (
+                    name,
+                    self._within(source, self._with_facts(name, before - after, facts, source.name, z, None)),
+                )
 
     def _of_dead_edge(self, edge: Edge) -> Iterator[tuple[str, Matrix]]:
         """R5: zᵀPz + Σ m q − ε (f1² or f2²) ⪰ 0 with ε > 0: where V ≤ 0 the edge is never taken."""
@@ -211,18 +224,21 @@ class Forms:
             raise RejectedError(f"{self.name}: in the limit nothing excludes {edge.name}")
         facts, z = facts_at(self._document, edge), self._variables(0)
         source = self._document.locations[edge.source]
-        for node in self._times(edge):
+        for node in self.times(edge):
             name = f"edge/{edge.name}/{node}"
             above = read_above(self._document, name, self._above(edge, node))
-            for before in self._before(f"edge/{edge.name}", source, self._times(edge), node):
-                yield name, self._within(source, self._with_facts(name, before - above, facts, z, None))
+            for before in self._before(f"edge/{edge.name}", source, self.times(edge), node):
+                yield (
+                    name,
+                    self._within(source, self._with_facts(name, before - above, facts, source.name, z, None)),
+                )
         self.never.add(edge.name)
 
     def _above(self, edge: Edge, node: int) -> Table:
         name = f"edge/{edge.name}/{node}"
         return mapping(mapping(self._multipliers.get(name, {}), name).get("above", {}), name)
 
-    def _times(self, edge: Edge) -> range:
+    def times(self, edge: Edge) -> range:
         """Return the nodes of the source that cover the times of the clock at which the edge may be taken."""
         nodes = self.nodes[edge.source]
         low = max(i for i, node in enumerate(nodes) if node <= edge.first)
@@ -232,7 +248,7 @@ class Forms:
     def _pairs(self, edge: Edge) -> list[tuple[int, int]]:
         """Return the pairs of nodes at which R2 is tested: those that cover the times of the edge."""
         target = self._document.locations[str(edge.target)]
-        nodes, others, times = self.nodes[edge.source], self.nodes[target.name], self._times(edge)
+        nodes, others, times = self.nodes[edge.source], self.nodes[target.name], self.times(edge)
         if edge.clock == "zero" or len(others) == 1:
             return [(i, 0) for i in times]
         if edge.clock == "any" or len(nodes) == 1:
@@ -248,7 +264,7 @@ class Forms:
         """R3: −z(0)ᵀPz(0) + Σ m q ⪰ 0. With R1 and R2, V ≤ 0 at all times."""
         Z, P = self._document.start_columns, self.P[self._document.start][0]
         M = (Z.T @ P @ Z).times(fmpq(-1))
-        return "start", self._with_facts("start", M, self._document.start_facts, Z, None)
+        return "start", self._with_facts("start", M, self._document.start_facts, "", Z, None)
 
     def _of_output(self, output: Output, location: Location) -> Iterator[tuple[str, Matrix]]:
         """R4: D1² f1² + D2² f2² + zᵀPz + Σ m q + Σ τ(…) − |y|² ⪰ 0: then |y|² ≤ D1² f1² + D2² f2²."""
@@ -269,7 +285,12 @@ class Forms:
                 name = f"output/{location.name}/{node}"
                 for V in self._before(f"output/{location.name}", location, times, node):
                     M = padded(V + units, z.width - z.height) - square(y)
-                    yield name, self._within(location, self._with_facts(name, M, location.facts, z, signals))
+                    yield (
+                        name,
+                        self._within(
+                            location, self._with_facts(name, M, location.facts, location.name, z, signals)
+                        ),
+                    )
 
     # Parts of inequalities.
 
@@ -314,13 +335,16 @@ class Forms:
         return unit_rows(range(size), size + signals)
 
     def _with_facts(
-        self, name: str, M: Matrix, facts: Sequence[str], z: Matrix, corner: Corner | None
+        self, name: str, M: Matrix, facts: Sequence[str], place: str, z: Matrix, corner: Corner | None
     ) -> Matrix:
         """Return M + Σ m q(z), and with a corner + Σ τ(|p|² − |Rz|²) + Σ m(2 k p² − 2 p·Cz)."""
         table = mapping(self._multipliers.get(name, {}), name)
         self._used.add(name)
         fields(table, name, set(), {"facts", "unknown", "above"})
-        M += of_facts(self._document, name, table, facts, z)
+        if self._rows is None or not place:
+            M += of_facts(self._document, name, table, facts, z)
+        else:
+            M += self._rows.of_facts(name, table, facts, place, z)
         of_signals = table.get("unknown", [])
         if not isinstance(of_signals, list):
             raise RejectedError(f"{name}: multipliers of signals are no list")

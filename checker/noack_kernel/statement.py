@@ -13,6 +13,7 @@ from noack_kernel.document import Document, entries, fields, read_table
 from noack_kernel.event_times import EventTimes, ResetRows
 from noack_kernel.exact import RejectedError
 from noack_kernel.forms import Forms
+from noack_kernel.row_bounds import RowBound, RowBounds
 
 FORMAT = "noack-forms 1"
 _DIGITS = 6
@@ -105,7 +106,7 @@ def prove(document: str, proof: str) -> Proven:
     """
     loop = Document(document)
     table = read_table(proof, FORMAT)
-    fields(table, "proof", {"format", "bounds"}, {"document", "lemmas", "times"})
+    fields(table, "proof", {"format", "bounds"}, {"document", "lemmas", "rows", "times"})
     if "document" in table and table["document"] != loop.digest:
         raise RejectedError("the proof is one of another document: it names another SHA-256")
     lemmas = [Forms(loop, entry) for entry in entries(table.get("lemmas", []), "lemmas")]
@@ -117,9 +118,11 @@ def prove(document: str, proof: str) -> Proven:
     if len({(forms.name, forms.starts) for forms in (*lemmas, *bounds)}) < len(lemmas) + len(bounds):
         raise RejectedError("two bounds or lemmas of one name and kind")
     usable = {forms.name: forms for forms in (*lemmas, *bounds) if forms.starts}
-    count = sum(forms.verify(usable) for forms in lemmas)
-    found = [_statement(loop, forms, usable) for forms in bounds]
+    rows = RowBounds(loop, [RowBound(loop, entry) for entry in entries(table.get("rows", []), "rows")])
+    count = sum(forms.verify(usable, rows) for forms in lemmas)
+    found = [_statement(loop, forms, usable, rows) for forms in bounds]
     levels = {forms.name: forms.levels for forms in bounds if forms.starts}
+    count += rows.verify(levels, usable)
     times = [ResetRows(loop, entry, levels).verify() for entry in entries(table.get("times", []), "times")]
     never = _require_dead(loop, [*lemmas, *bounds], times)
     _require_limits(loop, found)
@@ -132,12 +135,12 @@ def prove(document: str, proof: str) -> Proven:
     return Proven(found, least, never, count)
 
 
-def _statement(loop: Document, forms: Forms, usable: Mapping[str, Forms]) -> Statement:
+def _statement(loop: Document, forms: Forms, usable: Mapping[str, Forms], rows: RowBounds) -> Statement:
     output = forms.output
     assert output is not None
     everywhere = {*output.locations} == {*loop.locations}
     locations = None if everywhere else output.locations
-    count = forms.verify(usable)
+    count = forms.verify(usable, rows)
     return Statement(output.name, output.unit, forms.levels, loop.rate, forms.starts, locations, count)
 
 

@@ -15,12 +15,9 @@ import numpy as np
 from flint import fmpq
 
 from cosim.analysis.witness_store import StoredSearch, WitnessStore
-from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.core.progress import Progress, no_progress, part_of
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations, trace
-from noack.proof.files import proof_files
-from noack.proof.loop_document import Naming, NoDocumentError
 from noack.proof.statement_proof import prove_statement
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
@@ -38,14 +35,12 @@ from noack.theory.witnesses.regions import (
     region_witness_by_gains,
 )
 from noack_check.check import RejectedError
-from noack_check.document import read_table
-from noack_check.equations import equation_lines, read_region
+from noack_check.equations import read_region
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
 from noack_check.proof import Proof
 from noack_check.scenario import Enclosed as EnclosedPlant
 from noack_check.scenario import read_loop
-from noack_kernel import RejectedError as RejectedByKernelError
 
 _T = TypeVar("_T")
 _MOST_KEPT = 300
@@ -96,21 +91,6 @@ class Witnesses(NamedTuple):
         """Of what nothing is proven."""
         return [Unproven(s.plants, s.conditions, s.reason) for s in self.statements if s.proof is None]
 
-    def file_text(self) -> str:
-        """Return the file that ``noack-check`` reads."""
-        every = [s.document for s in self.statements if s.document is not None and "bounds" in s.document]
-        if not every:
-            raise CallerError("--witness: these are small-gain bounds; use --document and --proof instead")
-        documents = [{key: value for key, value in d.items() if key != "gains"} for d in every]
-        return json.dumps({"scenario": self.scenario, "statements": documents}, allow_nan=False)
-
-    def equations_text(self) -> str:
-        """Return the equations that the statements are about, for ``noack-check --equations``."""
-        documents = [s.document for s in self.statements if s.document is not None]
-        found = [equation_lines(read_table(d, "equations")) for d in documents if "equations" in d]
-        blocks = dict.fromkeys("".join(f"{line}\n" for line in lines) for lines in found)
-        return "\n".join(blocks)
-
 
 def plants_of(resolved: Scenario) -> list[str]:
     """Return the plants of a scenario's statements: "own", or "region" of equations, and "box"."""
@@ -149,23 +129,6 @@ def find_witnesses(
         found.append(find_statement(resolved, of, under, part, most_work, known))
     progress(1.0)
     return Witnesses(resolved_content(resolved), found)
-
-
-def require_covered(resolved: Scenario) -> None:
-    """Raise CallerError if the checker covers a scenario neither under its schedule nor under ideal ones."""
-    content = resolved_content(resolved)
-    for conditions in ("schedule", "ideal"):
-        try:
-            if resolved.coverage.is_linear:
-                read_loop(content, box=False, ideal=conditions == "ideal")
-            else:
-                plant = plant_on_regions(resolved, content, conditions)
-                plant.on(_NEAR * plant.typical)
-        except (RefusedError, NotEnclosedError) as error:
-            if conditions == "ideal":
-                raise CallerError(f"--witness: {error}") from None
-        else:
-            return
 
 
 def resolved_content(resolved: Scenario) -> dict[str, object]:
@@ -217,8 +180,6 @@ def find_statement(
     except (RefusedError, NoWitnessError, NotEnclosedError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
-    if why := _rejected_by_kernel(loop, witness.document):
-        return WitnessedStatement(plants, conditions, None, None, f"the kernel rejects the proof: {why}")
     return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds, loop)
 
 
@@ -373,23 +334,6 @@ def _known_or_found(
 
 _proofs = dict[tuple[str, str], Proof]()
 """What the checker has proven in this process, by loop and document: loops with equal numbers share it."""
-_of_kernel = dict[tuple[str, str], str]()
-"""Why the kernel has rejected a proof in this process, or an empty text."""
-
-
-def _rejected_by_kernel(loop: Loop, document: Mapping[str, object]) -> str:
-    """Return why the kernel rejects the proof of a loop's bounds by forms; empty if it accepts the proof."""
-    key = WitnessStore(loop).name, _digest(document)
-    if key not in _of_kernel:
-        why = ""
-        try:
-            proof_files(loop, document, Naming("loop")).verify()
-        except NoDocumentError:  # bounds by gains, which only the checker verifies
-            pass
-        except RejectedByKernelError as error:
-            why = str(error)
-        _keep(_of_kernel, key, why)
-    return _of_kernel[key]
 
 
 def _digest(document: Mapping[str, object]) -> str:

@@ -20,6 +20,8 @@ class ProofFiles(NamedTuple):
     document: str
     proof: str
     """The contents of the files."""
+    output_names: Mapping[str, str]
+    """The document's names of the outputs, by those of the search."""
 
     @property
     def words(self) -> str:
@@ -39,7 +41,7 @@ def proof_files(loop: Loop, statement: Mapping[str, object], naming: Naming) -> 
     """
     document = document_of(loop, statement, naming)
     proof = write_proof(document, _bounds(statement), apart_of(loop, statement))
-    return ProofFiles(document.table, as_text(document.table), as_text(proof))
+    return ProofFiles(document.table, as_text(document.table), as_text(proof), document.output_names)
 
 
 def document_of(loop: Loop, statement: Mapping[str, object], naming: Naming) -> LoopDocument:

@@ -8,6 +8,7 @@ from typing import Any
 
 from flint import arb
 
+from noack.proof.error_rows import ErrorRows
 from noack.proof.event_times import EventTimes, levels_of
 from noack.proof.loop_document import DRIFT, ETA, LoopDocument, Table
 from noack.proof.numbers import as_written, quotient, simplest
@@ -190,7 +191,10 @@ def write_proof(document: LoopDocument, bounds: Sequence[Mapping[str, Any]], apa
     at_start = [edge for edge in document.dead_edges if edge["from"].startswith("start")]
     if lemmas := [lemma for edge in at_start if (lemma := write_quiet_start(document, edge)) is not None]:
         proof["lemmas"] = lemmas
-    if times := [*EventTimes(document, levels_of(bounds)).entries(apart_s)]:
+    levels = levels_of(bounds)
+    if document.model.errors is not None and DRIFT in levels:
+        proof["rows"] = [*ErrorRows(document, levels[DRIFT], lemmas).entries()]
+    if times := [*EventTimes(document, levels).entries(apart_s)]:
         proof["times"] = times
     return proof
 

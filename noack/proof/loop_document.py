@@ -55,6 +55,8 @@ _EDGES = {
 """What the ends of names of edges mean."""
 ETA, NEXT_ETA = "√η", "next √η"
 """The coordinate of a rule's dynamic variable η, and its value after a test."""
+BOUND_OF_E, BOUND_OF_W = "bound of e", "bound of w"
+"""What a proof has as bounds of rows."""
 DRIFT = "drift"
 """The output W(ẋ − Hx), as the search calls it."""
 
@@ -140,12 +142,16 @@ class LoopDocument:
         self._name_facts()
         self.motions: dict[str, list[Table]] = {}
         self._motion_names: dict[int, str] = {}
-        self.location_facts = [[self.fact(Q) for Q in (*p.silent, *p.facts)] for p in self.model.locations]
+        self.location_facts = [
+            [*map(self.fact, place.silent), *map(self._assumption, place.facts)]
+            for place in self.model.locations
+        ]
         self.clocks = [self._clock(place, index) for index, place in enumerate(self.model.locations)]
         locations = [self._location(index) for index in range(len(self.model.locations))]
         self.edge_names = self._edge_names()
         edges = [self._edge(edge, name) for edge, name in self.edges]
         self.dead_edges = [*self._dead_edges()]
+        self._require_counted()
         self.output_names = self._output_names([*dict.fromkeys(outputs)])
         self.outputs = [self._output(name) for name in self.output_names]
         self.table: Table = {
@@ -276,8 +282,6 @@ class LoopDocument:
             name = self.labels[source]
             self.rows[name] = [[int(c == source) for c in self.used]]
             self._add_fact(f"noise {name}", [name], [unit], "bound of the noise of a measurement", Q)
-        if model.errors is not None:
-            self._add_assumed()
         for edge in model.edges:
             if edge.memory is not None and not is_zero(edge.memory):
                 self._add_memory(edge.memory)
@@ -314,29 +318,10 @@ class LoopDocument:
                 rows = [[0 if j in noisy else v for j, v in enumerate(row)] for row in self.rows[name]]
                 self.rows[f"{name} without noise"] = rows
 
-    def _add_assumed(self) -> None:
-        """Add bounds of e and w that another argument proves by induction over the events."""
-        model, errors = self.model, self.model.errors
-        assert errors is not None
-        pairs: dict[str, tuple[arb_mat, arb]] = {"e": (model.e, arb(1))}
-        for lost in range(self.loop.losses + 1):
-            for sent in range(self._assumed.later + 2):
-                if lost + sent:
-                    pairs[f"w, {lost} lost, {sent} recent"] = model.w, errors.chain.factor(lost, sent)
-        wanted = {_key(Q) for place in model.locations for Q in place.facts}
-        for name, (error, factor) in pairs.items():
-            Q = model.at_most(error, factor)[0]
-            if _key(Q) not in wanted or _key(Q) in self._named:
-                continue
-            self.rows[name] = self.columns(self.loop.weight * error)
-            limits = [
-                self._multiple(unit, factor * size)[0]
-                for unit, size in (("f1", errors.decaying), ("f2", errors.constant))
-                if self.has(unit)
-            ]
-            self.rows[f"limit of {name}"] = limits
-            words = "assumed here, and proven by induction over the events"
-            self._add_fact(f"bound of {name}", [name], [f"limit of {name}"], words, Q)
+    def _assumption(self, Q: arb_mat) -> str:
+        """Return the name of what the model assumes: a bound of rows, which the proof has."""
+        is_of_e = _key(Q) == _key(self.model.at_most(self.model.e, arb(1))[0])
+        return BOUND_OF_E if is_of_e else BOUND_OF_W
 
     def _multiple(self, unit: str, size: arb) -> list[list[Number]]:
         return [[least_above(size) if self.labels[c] == unit else 0 for c in self.used]]
@@ -403,7 +388,7 @@ class LoopDocument:
             "name": place.name,
             "coordinates": [self.labels[c] for c in place.coordinates if c not in units],
             "motion": self._motion(place.flows),
-            "facts": self.location_facts[index],
+            "facts": [fact for fact in self.location_facts[index] if fact in self.facts],
         }
         return found if clock is None else found | {"clock": exact(clock)}
 
@@ -477,9 +462,9 @@ class LoopDocument:
         Such an event is no test's that comes as early as tests may come: the times of tests exclude others.
         """
         model, times = self.model, self.loop.times
-        if model.is_by_tests or model.is_periodic or self._assumed.later or not compares_error(self.loop):
+        if model.is_by_tests or model.is_periodic or not compares_error(self.loop):
             return
-        ends = {"0 later": times.delay}
+        ends = {} if self._assumed.later else {"0 later": times.delay}
         if not self._assumed.later_at_start:
             ends["start, 0 later"] = times.start
         for place in model.locations:
@@ -498,6 +483,19 @@ class LoopDocument:
                 "facts": [*self._event_facts(), *(self.fact(Q) for Q in model.noise_bounds)],
                 "event": True,
             }
+
+    def _require_counted(self) -> None:
+        """Require that the document has all events that the times of tests allow, or excludes them."""
+        times, dead = self.loop.times, {str(edge["from"]) for edge in self.dead_edges}
+        counts = {
+            "0 later": (self._assumed.later, times.delay),
+            "start, 0 later": (self._assumed.later_at_start, times.start),
+        }
+        for name, (count, end) in counts.items():
+            is_late = (count + 1) * times.least_apart < end
+            has_test = last_test_before(times, end) > 0 or times.sampling == 0
+            if is_late and has_test and name not in dead:
+                raise NoDocumentError(f"more events than {count} may happen in {name!r}")
 
     def _event_facts(self) -> list[str]:
         """Return the facts of an event by the rule's comparison."""
@@ -555,8 +553,8 @@ class LoopDocument:
             return found | {"input": int(name[2:-1])}
         if name == DRIFT:
             where = [place for place in places if not place.startswith("start")]
-            rows = product(self.error_matrix, self._error_rows)
-            velocity = [[-entry for entry in row] for row in self._error_rows]
+            rows = product(self.error_matrix, self.error_rows)
+            velocity = [[-entry for entry in row] for row in self.error_rows]
             return found | {"in": where, "rows": written(rows), "velocity": written(velocity)}
         return found | {"rows": self.columns(model.output(name, model.locations[0])[0][0])}
 
@@ -568,7 +566,7 @@ class LoopDocument:
         return [[as_written(float(M[i, j].mid())) for j in range(loop.n)] for i in range(loop.n)]
 
     @cached_property
-    def _error_rows(self) -> Fractions:
+    def error_rows(self) -> Fractions:
         """The rows We, as decimals of the document."""
         rows = self.loop.weight * self.model.error_rows[0] * self._select
         return [

@@ -4,13 +4,27 @@ from collections.abc import Mapping
 
 from flint import arb, fmpq
 
+from noack.proof.files import proof_files
 from noack.proof.gains_document import gains_files
 from noack.proof.loop_document import Naming, NoDocumentError
+from noack_check.balls import identity, rows_of
 from noack_check.check import RejectedError
+from noack_check.document import read_number
 from noack_check.loop import Loop
-from noack_check.proof import Bound, Proof, prove
+from noack_check.norms import spectral_norm
+from noack_check.proof import (
+    Assumptions,
+    Bound,
+    Proof,
+    at_tests,
+    last_test_before,
+    read_assumptions,
+    read_entry,
+)
 from noack_check.sentences import size, smallest_bounds
 from noack_gains import RejectedError as RejectedGainsError
+from noack_kernel import Proven
+from noack_kernel import RejectedError as RejectedByKernelError
 
 _MUCH = 1.03
 """Gains are of use if some figure is smaller with them, or a time larger, by more than this factor."""
@@ -24,12 +38,80 @@ def prove_statement(loop: Loop, document: Mapping[str, object]) -> Proof:
     """
     if not isinstance(document, Mapping):
         raise RejectedError("not a table")
-    forms = {key: value for key, value in document.items() if key != "gains"}
     if "gains" not in document:
-        return prove(loop, forms)
+        return prove_by_forms(loop, document)
     if "bounds" not in document:
         return prove_by_gains(loop, document)
-    return joined(prove(loop, forms), prove_by_gains(loop, document))
+    return joined(prove_by_forms(loop, document), prove_by_gains(loop, document))
+
+
+def prove_by_forms(loop: Loop, document: Mapping[str, object]) -> Proof:
+    """Return what the bounds of a document prove: those that the kernel proves of the loop document.
+
+    Raises:
+        RejectedError: they are not proven, or no loop document describes the loop.
+    """
+    rate = read_number(document, "rate")
+    assumed = read_assumptions(loop, rate, document)
+    entries = document.get("bounds")
+    if (
+        not isinstance(entries, list)
+        or not all(isinstance(entry, Mapping) for entry in entries)
+        or not entries
+    ):
+        raise RejectedError("bounds: not a list of tables")
+    found = [read_entry(loop, entry, assumed) for entry in entries]
+    if len({(each.output, each.from_start) for each in found}) < len(found):
+        raise RejectedError("bounds: an output occurs twice")
+    try:
+        files = proof_files(loop, document, Naming("loop"))
+        proven = files.verify()
+    except NoDocumentError as error:
+        raise RejectedError(str(error)) from None
+    except RejectedByKernelError as error:
+        raise RejectedError(f"the kernel rejects the proof: {error}") from None
+    searched = {label: name for name, label in files.output_names.items()}
+    bounds = []
+    for each in proven.bounds:
+        decaying, constant = (arb(level).sqrt() for level in each.levels)
+        bound = Bound(searched[each.output], decaying, constant, each.from_start)
+        if not bound.decaying.is_finite() or not bound.constant.is_finite():
+            raise RejectedError("bounds: not finite")
+        bounds.append(_about(loop, _joined(bound) if rate == 0 else bound))
+    apart, first, is_quiet = _times(loop, assumed, proven)
+    return Proof(rate, tuple(bounds), apart, first, is_quiet)
+
+
+def _times(loop: Loop, assumed: Assumptions, proven: Proven) -> tuple[fmpq | None, fmpq | None, bool]:
+    """Return least times between events, and of the first event after t = 0, and whether the start is quiet.
+
+    What the kernel has proven is a time in which none happens; events come at tests.
+    """
+    times = loop.times
+    apart = max((each.apart for each in proven.least_times), default=None)
+    is_quiet = assumed.later_at_start == 0
+    first: fmpq | None = fmpq(0)
+    if times.start == 0:  # the event at t = 0 counts as others do
+        first = apart
+    elif is_quiet:
+        first = last_test_before(times, times.start) if times.sampling > 0 else times.start
+    return at_tests(times, apart), at_tests(times, first), is_quiet
+
+
+def _joined(bound: Bound) -> Bound:
+    """Return a bound by forms whose units do not decay: f₁ = f₂ = 1, and |Cz|² ≤ D₁² + D₂²."""
+    return bound._replace(decaying=arb(0), constant=(bound.decaying**2 + bound.constant**2).sqrt())
+
+
+def _about(loop: Loop, bound: Bound) -> Bound:
+    """Return the bound of an output itself, x being at most ``loop.offset`` from where the loop has it."""
+    output, n = bound.output, loop.n
+    if loop.offset == 0 or output[0] not in "xy":
+        return bound
+    row = identity(n) if output == "x" else loop.output_rows if output[0] == "y" else identity(n)
+    if "[" in output:
+        row = rows_of(row, [int(output[2:-1])])
+    return bound._replace(constant=bound.constant + loop.offset * spectral_norm(row))
 
 
 def prove_by_gains(loop: Loop, document: Mapping[str, object]) -> Proof:

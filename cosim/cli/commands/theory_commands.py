@@ -28,7 +28,7 @@ app = typer.Typer()
         ("noack certify lane_following", "its plant, and all plants of its uncertainty box"),
         ("noack certify lane_following --verbose", "every bound, setting and assumption"),
         ("noack certify lane_weighted --late 6 --json", "allow 6 steps of lateness"),
-        ("noack certify lane_following --witness lane.json", "for the program noack-check"),
+        ("noack certify lane_following --document loop.json --proof proof.json", "for noack-check"),
         ("noack certify lane_following --document loop.json --proof proof.json", "as two files"),
         ("noack certify lane_following --require certificate", "exit status 1 if there is none"),
     ),
@@ -59,22 +59,6 @@ def certify(
         Option(
             callback=opt.usable_path,
             help="Write the certificates for MATLAB and Octave (.mat).",
-        ),
-    ] = None,
-    witness: Annotated[
-        Path | None,
-        Option(
-            callback=opt.usable_path,
-            help="Write the witnesses of the proven bounds to this file (.json), for the program "
-            "noack-check.",
-        ),
-    ] = None,
-    equations: Annotated[
-        Path | None,
-        Option(
-            callback=opt.usable_path,
-            help="Write the plant's equations that the witnesses are about to this file, for noack-check "
-            "--equations.",
         ),
     ] = None,
     document: Annotated[
@@ -119,37 +103,23 @@ def certify(
     """
     from cosim.analysis.certificates import certificates_of
     from cosim.analysis.loop_files import files_of_widest
-    from cosim.analysis.witnesses import require_covered
     from cosim.live.monitoring.progress import work_bar
     from cosim.output.certificate_report import certificate_document
     from cosim.output.export.mat_export import save_mat
     from cosim.output.requirements import uncovered_as_unmet, unmet_by_scenario
     from cosim.record.run_directory import write_output
     from noack.core.file_access import require_suffix
-    from noack.scenario.resolution import resolve
     from noack.theory.witnesses.effort import MOST_WORK
 
     if out is not None:
         require_suffix(out, "--out", ".mat")
-    if equations is not None and witness is None:
-        raise CallerError("--equations: the equations are those of the witnesses; add --witness FILE")
     if (document is None) != (proof is None):
         raise CallerError("--document and --proof: noack-check needs both files; add the other option")
     loaded = opt.load_loop(scenario, settings, loop, network)
-    if witness is not None:
-        require_covered(own := resolve(loaded))
-        if equations is not None and own.coverage.is_linear:
-            raise CallerError("--equations: the plant is linear; its statements need no file of equations")
     with uncovered_as_unmet(require or ()):
         result = certificates_of(loaded, late)
     with work_bar("finding and verifying proofs" if search else "verifying proofs", lines=True) as bar:
         witnesses = result.prove(bar, MOST_WORK if search else 0.0)
-    if witness is not None and witnesses.are_any:
-        write_output(witness, witnesses.file_text())
-        print_to_stderr(f"noack: wrote {witness}, which noack-check verifies")
-        if equations is not None:
-            write_output(equations, witnesses.equations_text())
-            print_to_stderr(f"noack: wrote {equations}; compare it with the plant's code")
     if document is not None and proof is not None:
         files = files_of_widest(result.scenario, witnesses)
         files.verify()
@@ -163,9 +133,6 @@ def certify(
     show(page, json=json, tables=tables)
     if out is not None:
         save_mat(result.to_json(), out)
-    if witness is not None and not witnesses.are_any:
-        print_to_stderr(f"noack: no witness was found; {witness} is not written")
-        return ExitStatus.FAILED
     if require:
         return status_of(unmet_by_scenario(result, require))
     is_proven = result.is_proven_stable or any(certificate.exists for _, certificate in result)

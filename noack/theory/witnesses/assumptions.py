@@ -4,41 +4,32 @@ Each guess leads to a bound of the drift or of the error, and this to the next g
 itself. Nothing here has to be right: :mod:`noack_check.proof` proves what is assumed.
 """
 
-import contextlib
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from flint import arb, fmpq
-from scipy.linalg import expm, logm, schur, solve_continuous_lyapunov
+from scipy.linalg import expm, logm, schur
 
-from noack.core.linear_systems import Matrix
+from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
+from noack.proof.quiet_start import write_quiet_start
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.balls import matrix, number
-from noack_check.check import RejectedError
 from noack_check.loop import Loop
-from noack_check.model import Chain, Errors, thresholds
+from noack_check.model import thresholds
 from noack_check.noise import noise_of
 from noack_check.norms import growth
-from noack_check.proof import (
-    MOST_LATER,
-    Assumptions,
-    Bound,
-    compares_error,
-    prove_first_event,
-    require_few_at_start,
-    require_few_later,
-    sensor_error,
-    share_of_errors,
-)
+from noack_check.proof import MOST_LATER, Assumptions, compares_error, last_test_before, weighted
 
 _ROOM = 1.01
 """A guess is confirmed if what follows from it is smaller by this factor."""
 _FURTHER = 1.3
 """The next guess exceeds what followed from the last one by this factor."""
 
+_SPLITS = np.geomspace(1e-3, 1e3, 121)
+"""Tried numbers s of (a + b)² ≤ (1 + s) a² + (1 + 1/s) b²."""
 _AT_ONCE, _FASTEST, _MOST_TURN = 1e-3, 1e-6, 3.0
 """An error of an observer that decays, or turns, more between two tests has no smooth part."""
 _NEARLY, _MOST_STEPS = 1 - 1e-4, 30
@@ -46,25 +37,20 @@ _NEARLY, _MOST_STEPS = 1 - 1e-4, 30
 
 
 def first_assumptions(loop: Loop, rate: float) -> dict[str, object]:
-    """Return a document without bounds: its rate, its chain if it is used, and what is assumed at first.
+    """Return a document without bounds: its rate, and what is assumed at first.
 
     A rule that compares ‖W e_s‖ may have no event while an update is on its way; of others each test may
-    be one.
+    be one. With a held input, and with events that need no comparison, forms need a bound of the errors.
     """
     document: dict[str, object] = {"rate": rate}
-    if not loop.times.period > 0 and (chain := _chain(loop, rate)) is not None:
-        document["chain"] = chain
     if (smooth := smooth_part(loop)) is not None:
         document["observer"] = smooth
     later, at_start = 0, 0
-    try:
-        require_few_at_start(loop, Assumptions(None, 0, 0, None))
-    except RejectedError:
-        at_start = _most_between(loop, loop.times.start)
-    if at_start or not compares_error(loop):
-        later = _most_between(loop, loop.times.delay)
+    if not compares_error(loop) or not starts_quietly(loop, rate):
+        later, at_start = (_most_between(loop, time) for time in (loop.times.delay, loop.times.start))
     document |= {"later": later, "later_at_start": at_start}
-    if (loop.holds or loop.rule.always) and compares_error(loop) and "chain" in document:
+    is_still = loop.holds and rate == 0
+    if (is_still or loop.rule.always) and compares_error(loop) and not loop.noise.ncols():
         share = 1.1 if loop.times.sampling > 0 else 1.0
         document = with_errors(document, [share * float(each) for each in thresholds(loop, number(rate))])
     return document
@@ -91,11 +77,15 @@ def with_errors(document: Mapping[str, object], sizes: Sequence[float]) -> dict[
     return {**document, "errors": {"decaying": decaying, "constant": constant}}
 
 
-def _share_of(sizes: Sequence[float], loop: Loop, rate: float, drift: Sequence[float]) -> float:
-    """Return the share of errors of some sizes that the sensor's error reaches."""
-    decaying, constant = (number(size) for size in sizes)
-    errors = Errors(decaying, constant, Chain(number(1.0), number(1.0)))
-    return float(share_of_errors(loop, number(rate), _bound(drift), errors).mid())
+def starts_quietly(loop: Loop, rate: float) -> bool:
+    """Return whether a lemma is found that no event follows the one at t = 0 before the first input acts."""
+    none = Assumptions(None, 0, 0, noise=noise_of(loop, number(rate)))
+    try:
+        document = LoopDocument(loop, number(rate), none, (), Naming("loop"))
+    except NoDocumentError:
+        return False
+    edges = [edge for edge in document.dead_edges if edge["from"].startswith("start")]
+    return all(write_quiet_start(document, edge) is not None for edge in edges)
 
 
 def next_assumptions(
@@ -108,70 +98,63 @@ def next_assumptions(
     following, errors = {**document, "later": later}, document.get("errors")
     if not isinstance(errors, Mapping):
         return None if later == document["later"] else following
-    share = _share_of((errors["decaying"], errors["constant"]), loop, rate, drift)
+    sizes = errors["decaying"], errors["constant"]
+    share = _share_of(sizes, loop, rate, drift)
     is_exact = not loop.times.sampling > 0
     if later == document["later"] and (is_exact or _ROOM * share < 1):
         return None
     units = [float(each) for each in thresholds(loop, number(rate))]
-    sensor = sensor_error(loop, number(rate), _bound(drift))
-    needed = [float(sensor.decaying), float(sensor.constant)]
+    largest, total = _growth_between_tests(loop, rate)
+    needed = [largest * unit + total * size for unit, size in zip(units, drift, strict=True)]
     grown = [unit + _FURTHER * (size - unit) for size, unit in zip(needed, units, strict=True)]
     factor = max(_ROOM**2 * _share_of(grown, loop, rate, drift), 1.0)
     return with_errors(following, [factor * size for size in grown])
 
 
+def _growth_between_tests(loop: Loop, rate: float) -> tuple[float, float]:
+    """Return the supremum and the integral of ‖e^{Gs}‖, G = W(H + r)W⁻¹, between two tests."""
+    largest, total = growth(weighted(loop, number(rate)), arb(loop.times.sampling))
+    return float(largest.abs_upper()), float(total.abs_upper())
+
+
+def _share_of(sizes: Sequence[float], loop: Loop, rate: float, drift: Sequence[float]) -> float:
+    """Return the share of errors of some sizes that the sensor's error reaches between two tests.
+
+    It is the larger one of both units, with the best split of (a + b)² ≤ (1 + s) a² + (1 + 1/s) b².
+    """
+    largest, total = _growth_between_tests(loop, rate)
+    units = [float(each) for each in thresholds(loop, number(rate))]
+    triples = [triple for triple in zip(sizes, units, drift, strict=True) if any(triple)]
+    return min(
+        max(
+            ((1 + s) * (largest * unit) ** 2 + (1 + 1 / s) * (total * push) ** 2) ** 0.5 / size
+            if size
+            else math.inf
+            for size, unit, push in triples
+        )
+        for s in _SPLITS
+    )
+
+
 def _needed_later(loop: Loop, document: Mapping[str, object], apart_s: float) -> int:
-    """Return the most events while an update is on its way, if two are so far apart."""
-    later, at_start = document["later"], document["later_at_start"]
+    """Return the most events while an update is on its way: none, or one at each test.
+
+    ``apart_s``: two events are so far apart.
+    """
+    later, times = document["later"], loop.times
     assert isinstance(later, int)
-    while later < _most_between(loop, loop.times.delay):
-        with contextlib.suppress(RejectedError):
-            require_few_later(
-                loop, Assumptions(None, later, 0, None), None if at_start else number(apart_s).fmpq()
-            )
-            break
-        later += 1
-    return later
+    most = _most_between(loop, times.delay)
+    if later or not (most or times.sampling == 0 < times.delay):
+        return later
+    last_s = float(arb(last_test_before(times, times.delay)))
+    is_due = loop.rule.always and times.due <= last_test_before(times, times.delay)
+    return 0 if last_s < apart_s and not is_due else most
 
 
 def _most_between(loop: Loop, time: fmpq) -> int:
     """Return the most events within a time after an event, if each test may be one."""
     least = loop.times.least_apart
     return max(int((time / least).ceil()) - 1, 0) if least > 0 else 0
-
-
-def _bound(drift: Sequence[float]) -> Bound:
-    decaying, constant = (number(level) for level in drift)
-    return Bound("drift", decaying, constant, True)
-
-
-def _chain(loop: Loop, rate: float) -> dict[str, object] | None:
-    """Return the gain of the paper's chain with the witness of its tail; None: the model does not decay."""
-    W = floats(loop.weight)
-    G = W @ floats(loop.H) @ np.linalg.inv(W) + rate * np.eye(loop.n)
-    if not G.any():
-        return {"gain": 1.0, "tail": np.eye(loop.n).tolist()}
-    if np.linalg.eigvals(G).real.max() >= 0:
-        return None
-    tail = solve_continuous_lyapunov(G.T, -np.eye(loop.n))
-    gain = max(_sups(G)) * (1 + 3e-4) + 1e-9
-    return {"gain": gain, "tail": ((tail + tail.T) / 2).tolist()}
-
-
-def _sups(G: Matrix) -> Iterator[float]:
-    """Yield the largest of ‖e^{Gτ}‖ on grids of 256 times until it has decayed."""
-    slowest = -float(np.linalg.eigvals(G).real.max())
-    step = 0.02 / max(float(np.linalg.norm(G, 2)), slowest)
-    cells = np.eye(len(G))[None]
-    for doubling in range(8):
-        cells = np.concatenate([cells, cells @ expm(G * step * 2**doubling)])
-    power, following = np.eye(len(G)), expm(G * step * 256)
-    for _ in range(400):
-        sizes = np.linalg.norm(cells @ power, 2, axis=(1, 2))
-        yield float(sizes.max())
-        if sizes[-1] < 1e-2:
-            return
-        power = following @ power
 
 
 def smooth_part(loop: Loop) -> dict[str, object] | None:
@@ -247,15 +230,6 @@ def inter_event_s(loop: Loop, rate: float, drift: Sequence[float]) -> float:
 def before_due(loop: Loop) -> float:
     """Return a time before which no event comes without the rule's comparison; infinite: each needs it."""
     return (1 - 1e-9) * float(arb(loop.times.due)) if loop.rule.always else math.inf
-
-
-def first_event_s(loop: Loop, drift: Sequence[float], most: float) -> float:
-    """Return a share of ``most`` before which no event follows the one at t = 0; 0 without one."""
-    for share in (1.0, 0.9, 0.75, 0.5, 0.25):
-        with contextlib.suppress(RejectedError):
-            prove_first_event(loop, _bound(drift), number(share * most), loop.times.start)
-            return share * most
-    return 0.0
 
 
 def _kinks(level: float, floor: float) -> list[float]:

@@ -9,10 +9,9 @@ import numpy as np
 
 from noack.core.progress import Progress, no_progress
 from noack.proof.semidefinite import Accuracy
-from noack.proof.statement_proof import joined, needs_gains, prove_by_gains
+from noack.proof.statement_proof import joined, needs_gains, prove_by_forms, prove_by_gains
 from noack.theory.witnesses.assumptions import (
     first_assumptions,
-    first_event_s,
     inter_event_s,
     next_assumptions,
     observer_decay,
@@ -30,7 +29,7 @@ from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Model
-from noack_check.proof import Bound, Proof, compares_error, conclude, prove_bound, read_assumptions
+from noack_check.proof import Bound, Proof, check_bound, compares_error, read_assumptions
 
 _COARSE = Accuracy(gap=1e-3, feasibility=1e-3, improves_steps=False)
 _ATTEMPTS = (
@@ -184,8 +183,7 @@ def _by_threshold(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) 
     of_drift = search.bound("drift")
     bounds = [*search.bounds(wanted), of_drift]
     drift = float(of_drift.bound.decaying), float(of_drift.bound.constant)
-    document["inter_event_s"] = apart = inter_event_s(loop, rates.rate, drift)
-    document["first_event_s"] = first_event_s(loop, drift, apart)
+    document["inter_event_s"] = inter_event_s(loop, rates.rate, drift)
     return search.witness(document, bounds, wanted)
 
 
@@ -409,12 +407,11 @@ class _OutputSearch:
         Raises:
             NoWitnessError: they do not prove what it assumes.
         """
-        loop = self._loop
+        loop, document = self._loop, {**document, "bounds": [each.entry for each in proven]}
         try:
-            proof = conclude(loop, document, self._assumed, [each.bound for each in proven])
+            proof = prove_by_forms(loop, document)
         except RejectedError as error:
             raise NoWitnessError(str(error)) from None
-        document = {**document, "bounds": [each.entry for each in proven]}
         with contextlib.suppress(NoWitnessError, RejectedError):
             gains = find_gains(loop, self._rates.rate, wanted.by_gains)
             both = joined(proof, prove_by_gains(loop, {**document, "gains": gains}))
@@ -455,7 +452,7 @@ class _OutputSearch:
         for is_last, found in self._accurate(output, decay, coarse, starts=starts):
             entry = _entry(output, decay, found, starts=starts)
             try:
-                bound = prove_bound(self._loop, self._rate, entry, self._assumed)
+                bound = check_bound(self._loop, self._rate, entry, self._assumed)
             except RejectedError as error:
                 why = str(error)
             else:
