@@ -1,4 +1,4 @@
-"""Forms that use each other (R6) and times between events (R10), in documents that are written by hand."""
+"""Forms that use each other (R6), times between events (R10), bounds of rows (R11), in documents by hand."""
 
 import copy
 import math
@@ -305,4 +305,199 @@ def test_a_time_between_events_that_is_not_proven_is_rejected(change: Change) ->
     document, proof = copy.deepcopy(growing(0.98 * REACHES_2_S))
     change(document, proof)
     with pytest.raises(RejectedError, match=R10_FAULTS[change]):
+        proven(document, proof)
+
+
+# Rows with bounds by norms: e with ė = −p and |p| ≤ 1 between tests, and w that an event increases by e.
+
+LEVEL = 2.0
+"""A silent test leaves |e| at most 2."""
+
+
+def errors() -> tuple[Table, Table]:
+    """Return a document with two losses, and the proof of |e| ≤ 2.2, |w| ≤ 2.2 or 4.4, and |e + w| ≤ 6.6."""
+    still = [0, 0, 0]
+    stays = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    adds = [[0, 0, 0], [1, 1, 0], [0, 0, 1]]
+    resets = [[0, 0, 0], [0, 0, 0], [0, 0, 1]]
+    tested = {"when": [0, 0.1], "clock": "zero"}
+    document: Table = {
+        "format": "noack-hybrid 1", "name": "errors",
+        "coordinates": [{"name": name, "unit": ""} for name in ("e", "w", "f2")],
+        "constant": "f2", "rows": {"e": [[1, 0, 0]], "level": [[0, 0, LEVEL]]},
+        "facts": {
+            "silent": {"less": ["e"], "more": ["level"], "words": "no event"},
+            "event": {"less": ["level"], "more": ["e"], "words": "an event"},
+        },
+        "motions": {
+            "m": [
+                {
+                    "matrix": [still, still, still], "input": [],
+                    "unknown": [{"column": [[-1], [0], [0]], "rows": [[0, 0, 1]]}],
+                }
+            ]
+        },
+        "locations": [
+            {
+                "name": f"{j} lost", "coordinates": ["e", "w"] if j else ["e"], "clock": 0.1, "motion": "m",
+                "facts": [],
+            }
+            for j in range(3)
+        ],
+        "edges": [
+            *(
+                {
+                    "name": f"{j} silent", "from": f"{j} lost", "to": f"{j} lost", "facts": ["silent"],
+                    "jump": stays, **tested,
+                }
+                for j in range(3)
+            ),
+            *(
+                {
+                    "name": f"{j} delivered", "from": f"{j} lost", "to": "0 lost", "facts": ["event"],
+                    "jump": resets, "event": True, **tested,
+                }
+                for j in range(3)
+            ),
+            *(
+                {
+                    "name": f"{j} lost", "from": f"{j} lost", "to": f"{j + 1} lost", "facts": ["event"],
+                    "jump": adds, "event": True, **tested,
+                }
+                for j in range(2)
+            ),
+        ],
+        "start": {"location": "0 lost", "columns": [[0], [0], [1]], "facts": []},
+        "outputs": [
+            {
+                "name": "push", "unit": "", "rows": [[0, 0, 0]], "velocity": [[-1, 0, 0]],
+                "in": ["0 lost", "1 lost", "2 lost"],
+            },
+            {"name": "sum", "unit": "", "rows": [[1, 1, 0]], "in": ["0 lost", "1 lost", "2 lost"]},
+        ],
+    }  # fmt: skip
+    places = [f"{j} lost" for j in range(3)]
+    nothing = {name: {"nodes": [0], "terms": [[]]} for name in places}
+    no_form = {"from": "start", "decay": 0, "matrices": {}, "forms": nothing}
+    push = {
+        "output": "push", "levels": [0, 1], **no_form,
+        "multipliers": {f"output/{name}/0": {"unknown": [1]} for name in places},
+    }  # fmt: skip
+    total = {
+        "output": "sum", "levels": [0, 43.6], **no_form,
+        "multipliers": {
+            "output/0 lost/0": {"facts": {"of e": 1.0001}},
+            **{
+                f"output/{j} lost/0": {"facts": {"of e": 1.0001 * (1 + j), "of w": 1.0001 * (1 + 1 / j)}}
+                for j in (1, 2)
+            },
+        },
+    }  # fmt: skip
+    of_e = {
+        "name": "of e", "rows": [[1, 0, 0]], "matrix": [[0]], "output": "push",
+        "in": {name: {"enter": [0, 4.001], "within": [0, 4.84], "split": 0.05} for name in places},
+        "multipliers": {f"edge/{j} silent": {"facts": {"silent": 1}} for j in range(3)},
+    }  # fmt: skip
+    sizes = [0, 4.841, 19.38]
+    of_w = {
+        "name": "of w", "rows": [[0, 1, 0]], "matrix": [[0]],
+        "in": {name: {"enter": [0, a], "within": [0, a]} for name, a in zip(places, sizes, strict=True)},
+        "multipliers": {
+            "edge/1 silent": {"facts": {"of w": 1}}, "edge/2 silent": {"facts": {"of w": 1}},
+            "edge/0 lost": {"facts": {"of e": 1.00001}},
+            "edge/1 lost": {"facts": {"of e": 2.0001, "of w": 2.0001}},
+        },
+    }  # fmt: skip
+    return document, {"format": "noack-forms 1", "bounds": [push, total], "rows": [of_e, of_w]}
+
+
+def test_rows_have_bounds_by_norms_which_forms_use() -> None:
+    assert proven(*errors()).sentences == ["|push| ≤ 1 at all times", "|sum| ≤ 6.60303 at all times"]
+
+
+def be_silent_at_more(document: Table, proof: Table) -> None:
+    document["rows"]["level"] = [[0, 0, 2.01]]
+
+
+def push_more(document: Table, proof: Table) -> None:
+    document["motions"]["m"][0]["unknown"][0]["rows"] = [[0, 0, 1.1]]
+
+
+def wait_longer_between_tests(document: Table, proof: Table) -> None:
+    for location in document["locations"]:
+        location["clock"] = 0.2
+
+
+def never_test(document: Table, proof: Table) -> None:
+    del document["locations"][1]["clock"]
+
+
+def add_more(document: Table, proof: Table) -> None:
+    """w := w + 1.01 e."""
+    document["edges"][7]["jump"] = [[0, 0, 0], [1.01, 1, 0], [0, 0, 1]]
+
+
+def move_w(document: Table, proof: Table) -> None:
+    document["motions"]["m"][0]["matrix"][1] = [0, -0.1, 0]
+
+
+def push_w(document: Table, proof: Table) -> None:
+    document["motions"]["p"] = copy.deepcopy(document["motions"]["m"])
+    document["motions"]["p"][0]["unknown"][0]["column"] = [[-1], [0.001], [0]]
+    for location in document["locations"][1:]:
+        location["motion"] = "p"
+
+
+def lose_one_more(document: Table, proof: Table) -> None:
+    """From "2 lost" to itself: w is not bounded any more."""
+    edge = copy.deepcopy(document["edges"][7])
+    document["edges"].append(edge | {"name": "2 lost", "from": "2 lost", "to": "2 lost"})
+    proof["rows"][1]["multipliers"]["edge/2 lost"] = {"facts": {"of e": 3.0001, "of w": 1.50001}}
+
+
+def start_with_an_error(document: Table, proof: Table) -> None:
+    document["start"]["columns"][0] = [2.1]
+
+
+def use_a_bound_where_there_is_none(document: Table, proof: Table) -> None:
+    del proof["rows"][0]["in"]["2 lost"]
+
+
+def take_the_name_of_a_fact(document: Table, proof: Table) -> None:
+    proof["rows"][0]["name"] = "silent"
+
+
+def leave_no_room(document: Table, proof: Table) -> None:
+    """At the time of a test the row may be at its bound, not below it."""
+    for place in proof["rows"][0]["in"].values():
+        place["within"] = place["enter"]
+
+
+def need_a_bound_that_is_not_proven(document: Table, proof: Table) -> None:
+    proof["bounds"][0]["from"] = "limit"
+    proof["bounds"][0]["decay"] = 1
+
+
+R11_FAULTS: dict[Change, str] = {
+    be_silent_at_more: "of e: not proven at edge/0 silent",
+    push_more: "not proven at output",
+    wait_longer_between_tests: "of e in 0 lost: it may exceed the bound",
+    never_test: "of e in 1 lost: it may exceed the bound, or the clock has no limit",
+    add_more: "of w: not proven at edge/1 lost",
+    move_w: "of w in 1 lost: the rows move in another way",
+    push_w: "of w in 1 lost: the rows move in another way",
+    lose_one_more: "of w: not proven at edge/2 lost",
+    start_with_an_error: "of e: not proven at start",
+    use_a_bound_where_there_is_none: "of e has no bound in 2 lost",
+    take_the_name_of_a_fact: "the name of another one, or of a fact",
+    leave_no_room: "of e in 0 lost: it may exceed the bound",
+    need_a_bound_that_is_not_proven: "push has no bound from the start on",
+}
+
+
+@pytest.mark.parametrize("change", R11_FAULTS, ids=lambda change: change.__name__)
+def test_a_bound_of_rows_that_is_not_proven_is_rejected(change: Change) -> None:
+    document, proof = copy.deepcopy(errors())
+    change(document, proof)
+    with pytest.raises(RejectedError, match=R11_FAULTS[change]):
         proven(document, proof)
