@@ -75,14 +75,14 @@ def main() -> None:
         "--equations",
         action=_StoreOnce,
         type=Path,
-        help="the plant's equations, by `noack certify NAME --witness W --equations FILE`; a statement about "
-        "equations needs them",
+        help="the plant's equations, by `noack certify NAME --document D --proof P --equations FILE`: that "
+        "the document allows all that they do is verified, too; a witness about equations needs them",
     )
     arguments = parser.parse_args()
     if arguments.proof is not None:
-        if arguments.scenario is not None or arguments.equations is not None:
-            parser.error("a loop document needs neither --scenario nor --equations")
-        sys.exit(verify(arguments.witness, arguments.proof))
+        if arguments.scenario is not None:
+            parser.error("a loop document needs no --scenario")
+        sys.exit(verify(arguments.witness, arguments.proof, arguments.equations))
     try:
         file = read_json(arguments.witness)
         given = None if arguments.scenario is None else read_toml(arguments.scenario)

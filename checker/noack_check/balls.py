@@ -81,11 +81,6 @@ def upto(end: arb) -> arb:
     return end / 2 + around_zero(end / 2)
 
 
-def between(low: arb, high: arb) -> arb:
-    """Return a ball that contains [low, high]."""
-    return low + upto(high - low)
-
-
 def frobenius(M: arb_mat) -> arb:
     """Return the root of the sum of squares of the entries, a bound of the spectral norm."""
     return arb(sum((entry * entry for entry in M.entries()), arb(0)).upper()).sqrt()

@@ -15,6 +15,9 @@ from noack_check.balls import (
     transpose,
     zeros,
 )
+from noack_equations import Along, Region
+
+__all__ = ["Along", "Loop", "Memory", "Noise", "Observer", "Region", "Rule", "Smooth", "Times", "no_smooth"]
 
 _MOST_STATES, _MOST_LOSSES = 40, 1000
 """A proof of a larger loop would take hours."""
@@ -140,20 +143,6 @@ class Noise(NamedTuple):
     smooth: "Smooth"
     sizes: tuple[arb, arb]
     """‖W n‖ is at most their sum, times f₁ and f₂."""
-
-
-class Along(NamedTuple):
-    """A disturbance p has p·C(x, u) ≥ k p², as friction that takes energy out of the plant."""
-
-    row: arb_mat  # C, (1, n + m); 0: nothing is known
-    least: arb  # k ≥ 0
-
-
-class Region(NamedTuple):
-    """|x_i| < x[i] and |u_j| < u[j]: where a plant's equations are enclosed; None: any value."""
-
-    x: tuple[arb | None, ...]
-    u: tuple[arb | None, ...]
 
 
 class Loop(NamedTuple):

@@ -24,13 +24,15 @@ from noack_check.balls import (
     transpose,
     zeros,
 )
+from noack_check.check import RejectedError
 from noack_check.document import read_table
-from noack_check.equations import LinearPlants, enclose, read_region
 from noack_check.keys import RefusedError, Table, refusals
 from noack_check.loop import Along, Loop, Memory, Observer, Region, Rule, Times
 from noack_check.norms import lyapunov_function, spectral_norm
 from noack_check.reference import Matrices, Moments, Segment, about_reference, padded
 from noack_check.times import NS_PER_S, Schedule, fraction, nanoseconds, nearest_ns
+from noack_equations import LinearPlants, enclose, region_of
+from noack_equations import RejectedError as RejectedEquationsError
 
 Rows = Sequence[Sequence[float]]
 _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
@@ -225,7 +227,24 @@ def read_enclosed(resolved: Table, document: Table) -> Enclosed:
     """
     B = _matrix(_table(resolved, "model"), "model.B")
     region = read_region(document, len(B), len(B[0]))
-    return Enclosed(enclose(read_table(document, "equations"), region), region)
+    try:
+        return Enclosed(enclose(read_table(document, "equations"), region), region)
+    except RejectedEquationsError as error:
+        raise RejectedError(str(error)) from None
+
+
+def read_region(document: Table, n: int, m: int) -> Region:
+    """Return the region of a document."""
+    table, found = read_table(document, "region"), []
+    for key, count in (("x", n), ("u", m)):
+        sizes = table.get(key)
+        if not isinstance(sizes, list) or len(sizes) != count:
+            raise RejectedError(f"region: not {count} sizes of {key}")
+        found.append(sizes)
+    try:
+        return region_of(found[0], found[1])
+    except RejectedEquationsError as error:
+        raise RejectedError(str(error)) from None
 
 
 def _with_equations(loop: Loop, resolved: Table, enclosed: Enclosed) -> Loop:

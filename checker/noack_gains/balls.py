@@ -80,13 +80,13 @@ def frobenius(M: arb_mat) -> arb:
     return arb(sum((entry * entry for entry in M.entries()), arb(0)).upper()).sqrt()
 
 
-def spectral_norm(M: arb_mat) -> arb:
-    """Return an upper bound of ‖M‖₂: the root of trace((MᵀM)^k)^(1/k), k = 2^8."""
+def spectral_norm(M: arb_mat, squarings: int = _SQUARINGS) -> arb:
+    """Return an upper bound of ‖M‖₂: the root of trace((MᵀM)^k)^(1/k), k = 2^squarings."""
     power = square(M)
-    for _ in range(_SQUARINGS):
+    for _ in range(squarings):
         power = power * power
     trace = sum((power[i, i] for i in range(power.nrows())), arb(0))
-    return arb(trace.abs_upper()).root(2 ** (_SQUARINGS + 1))
+    return arb(trace.abs_upper()).root(2 ** (squarings + 1))
 
 
 def norm_of(M: arb_mat) -> arb:

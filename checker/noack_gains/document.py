@@ -35,7 +35,7 @@ _REQUIRED = (
     "format", "name", "rate", "states", "inputs", "A", "B", "model", "gain", "weight", "start", "rule",
     "times", "losses", "disturbances", "noise", "outputs",
 )  # fmt: skip
-_OPTIONAL = ("about", "uncertainty", "before_input", "until", "offset", "while")
+_OPTIONAL = ("about", "uncertainty", "before_input", "until", "offset", "while", "equations")
 
 
 class Rule(NamedTuple):
@@ -211,7 +211,15 @@ class Document:
             raise RejectedError("rate: above that of the threshold")
         self.outputs = self._read_outputs(table["outputs"])
         self.limits = [self._read_limit(each) for each in entries(table.get("while", []), "while")]
+        self.equations = self._read_equations(table.get("equations"))
+        """The SHA-256 of a plant's equations of which another program verifies that they do no more."""
         self._require_times()
+
+    def _read_equations(self, value: object) -> str | None:
+        if value is None:
+            return None
+        fields(entry := mapping(value, "equations"), "equations", ("sha256",))
+        return text_of(entry["sha256"], "equations")
 
     def _matrix(self, table: Table, key: str, height: int, width: int) -> Matrix:
         return read_matrix(table[key], key, height, width)
@@ -392,3 +400,7 @@ class Document:
             mismatched=tuple(i for i, is_zero in enumerate(mismatch.zero_rows()) if not is_zero),
             compares_error=self.compares_error,
         )
+
+    def output(self, name: str) -> Output:
+        """Return an output by its name."""
+        return next(output for output in self.outputs if output.name == name)

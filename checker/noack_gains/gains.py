@@ -55,11 +55,11 @@ x = e^{At} x(0) + … gives a bound.
 *Conclusion.* For each signal these are inequalities v_i(t) ≤ (T v)(t) + g_i(t) with a positive linear T of
 the past, which maps y₁f₁ + y₂f₂ to at most F₁y₁ f₁ + F₂y₂ f₂. The solution has y > Fy + g in both units, and
 c₁ and c₂ exceed their bounds. Up to a time there are finitely many events (tests are apart; with tests at all
-times events are, too: see :mod:`.sentences`), and all signals are finite. Let λ be the least number with
+times events are, too: see :mod:`.words`), and all signals are finite. Let λ be the least number with
 v ≤ λ(y₁f₁ + y₂f₂) up to this time. If λ > 1, then v ≤ λ(Ty + g), as also √(θ² + λ²s²) ≤ λ√(θ² + s²), is at
 most λ(1 − ε)(y₁f₁ + y₂f₂) for an ε > 0: a contradiction. So v ≤ y₁f₁ + y₂f₂, up to any time. Where the plant
 is enclosed on a region, this holds up to the time at which x or u would leave it, and there it shows that
-they do not: see :mod:`.proof`.
+they do not: see :mod:`.statement`.
 """
 
 import math
@@ -604,7 +604,7 @@ class Gains:
     """
 
     def __init__(self, document: Document, table: Table) -> None:
-        self.document, self.rule = document, document.rule
+        self.document = document
         self.loop = loop = _followed(document.loop, table)
         self._witness = witness = read_witness(document, loop, table)
         shift = arb(loop.rate) * identity(loop.n)

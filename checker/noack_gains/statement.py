@@ -8,14 +8,14 @@ from typing import NamedTuple
 from flint import arb, fmpq
 
 from noack_gains.apart import share_of_threshold
-from noack_gains.balls import norm_of
+from noack_gains.balls import spectral_norm
 from noack_gains.document import Document, Output
 from noack_gains.gains import Gains
 from noack_gains.reading import RejectedError, Table, fields, read_table, size
 
 FORMAT = "noack-gains 1"
 _OPTIONAL = ("by_time", "tests", "window_s", "comparison", "model", "inter_event_s")
-_DIGITS = 6
+_DIGITS, _SQUARINGS = 6, 14
 _PLAIN_NAME = re.compile(r"[\w' ()-]+")
 _PLAIN_UNIT = re.compile(r"(1/)?[^\W\d][^\s|≤,;]{,19}|[%°][^\s|≤,;]{,9}|")
 """Names and units that cannot be taken for a part of a sentence; others are quoted."""
@@ -99,7 +99,7 @@ def _statement(loop: Document, output: Output, levels: tuple[arb, arb]) -> State
     """Return the bound of an output itself, x being at most ``offset`` from where the loop has it."""
     decaying, constant = levels
     if output.rows is not None and loop.offset > 0:
-        constant = constant + arb(loop.offset) * norm_of(output.rows.balls)
+        constant = constant + arb(loop.offset) * spectral_norm(output.rows.balls, _SQUARINGS)
     if not (decaying.is_finite() and constant.is_finite()):
         raise RejectedError(f"{output.name}: its bound is not finite")
     found = tuple(arb(level.upper()).fmpq() for level in (decaying, constant))

@@ -17,7 +17,7 @@ def in_words(document: Document) -> list[str]:
 
 def conditions(document: Document) -> list[str]:
     """Return what a bound is proven under, apart from the matrices: the lines that a sentence prints."""
-    return [*_events(document), *_times(document), *_noise(document)]
+    return [*_events(document), *_times(document), *_noise(document), *_runs(document)]
 
 
 def _lines(d: Document) -> Iterator[str]:
@@ -102,6 +102,23 @@ def _noise(d: Document) -> Iterator[str]:
         parts = [f"{_number(decaying)} e^(−{_number(d.rate)} t)"] if decaying > 0 else []
         parts += [_number(constant)] if constant > 0 else []
         yield f"at a test the sensor takes x + n for x, with ‖W n‖ ≤ {' + '.join(parts)}"
+
+
+def _runs(d: Document) -> Iterator[str]:
+    """Yield what a run has to be where nothing may keep two events apart.
+
+    With tests at all times a threshold does if it is above 0, and above what the noises of two measurements
+    add up to: only the rest has to be reached by a flow. An integral begins at 0.
+    """
+    rule, noise = d.rule, 2 * (d.noise[0] + d.noise[1])
+    if d.times.least_apart > 0:
+        return
+    if noise == 0 or rule.integrates:
+        is_kept = rule.level > 0 or rule.floor > 0
+    else:
+        is_kept = rule.floor > noise or (rule.rate == 0 and rule.level > noise)
+    if not is_kept:
+        yield "all this is about runs with finitely many events in finite time"
 
 
 def _output(output: Output, d: Document) -> str:

@@ -136,7 +136,10 @@ class Document:
             "start",
         }
         fields(
-            table, "document", required | {"outputs"}, {"decaying", "constant", "readings", "while", "about"}
+            table,
+            "document",
+            required | {"outputs"},
+            {"decaying", "constant", "readings", "while", "about", "equations"},
         )
         self.digest = hashlib.sha256(text.encode()).hexdigest()
         self.name = name_of(table["name"], "name")
@@ -160,6 +163,8 @@ class Document:
         _unique([output.name for output in outputs], "outputs")
         self.outputs = {output.name: output for output in outputs}
         self.limits = [self._limit(entry) for entry in entries(table.get("while", []), "while")]
+        self.equations = None if "equations" not in table else mapping(table["equations"], "equations")
+        """A claim about a plant's equations, which another program verifies; no bound depends on it."""
         for name, reading in mapping(table.get("readings", {}), "readings").items():
             self._read_reading(name, reading)
 

@@ -35,12 +35,11 @@ from noack.theory.witnesses.regions import (
     region_witness_by_gains,
 )
 from noack_check.check import RejectedError
-from noack_check.equations import read_region
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
 from noack_check.proof import Proof
 from noack_check.scenario import Enclosed as EnclosedPlant
-from noack_check.scenario import read_loop
+from noack_check.scenario import read_loop, read_region
 
 _T = TypeVar("_T")
 _MOST_KEPT = 300

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from noack.proof.equations_claim import add_claim
 from noack.proof.forms_proof import as_text, write_proof
 from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
 from noack.proof.words import in_words
@@ -48,7 +49,10 @@ def document_of(loop: Loop, statement: Mapping[str, object], naming: Naming) -> 
     """Return the loop document of a statement; raise NoDocumentError as :func:`proof_files`."""
     rate = read_number(statement, "rate")
     outputs = [str(bound["output"]) for bound in _bounds(statement)]
-    return LoopDocument(loop, rate, read_assumptions(loop, rate, statement), outputs, naming)
+    document = LoopDocument(loop, rate, read_assumptions(loop, rate, statement), outputs, naming)
+    if "equations" in statement:
+        add_claim(document, statement)
+    return document
 
 
 def _bounds(statement: Mapping[str, object]) -> list[Any]:

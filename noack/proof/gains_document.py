@@ -11,10 +11,12 @@ from typing import Any
 
 from flint import arb, arb_mat
 
+from noack.proof.equations_claim import add_claim_of_gains
 from noack.proof.forms_proof import as_text
 from noack.proof.loop_document import Naming, NoDocumentError, Table
 from noack.proof.numbers import exact, least_above, matrix, quotient, to_fraction
 from noack_check.balls import rows_of
+from noack_check.check import RejectedError as NoNoiseBoundError
 from noack_check.loop import Loop
 from noack_check.noise import noise_of
 from noack_gains import Document, Proven, RejectedError, in_words, prove
@@ -67,6 +69,8 @@ def gains_files(loop: Loop, statement: Mapping[str, object], naming: Naming) -> 
     if not isinstance(outputs, list):
         raise RejectedError("outputs: not a list")
     table, names = gains_document(loop, rate, outputs, naming)
+    if "equations" in statement:
+        add_claim_of_gains(table, loop, statement)
     document = as_text(table)
     return GainsFiles(table, names, document, proof_text(document, gains))
 
@@ -101,7 +105,12 @@ def gains_document(
     if not (math.isfinite(rate) and rate >= 0):
         raise RejectedError("rate: not a number of at least 0")
     n, m = loop.n, int(loop.B.ncols())
-    decaying, constant = noise_of(loop, arb(rate)).sizes
+    try:
+        decaying, constant = noise_of(loop, arb(rate)).sizes
+    except NoNoiseBoundError as error:
+        raise NoDocumentError(str(error)) from None
+    if not (decaying.is_finite() and constant.is_finite()):
+        raise NoDocumentError("the noise has no bound")
     names = _output_names(loop, outputs, naming)
     halves = {"A": _above(loop.half_A), "B": _above(loop.half_B)}
     model = {"A": matrix(loop.model_A), "B": matrix(loop.model_B)}

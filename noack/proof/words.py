@@ -67,6 +67,34 @@ def _lines(document: Table) -> Iterator[str]:
         yield from _output(output, names, len(document["locations"]))
     for limit in document.get("while", []):
         yield f"- the document ends when |{limit['output']}| reaches {_number(limit['less'])}"
+    if "equations" in document:
+        yield from _equations(document["equations"])
+
+
+def _equations(claim: Table) -> Iterator[str]:
+    """Yield what a document claims of a plant's equations."""
+    states = claim["states"]
+    inputs = [f"u{j}" for j in range(len(claim["B"][0]))]
+    yield from ("", "## The plant's equations, which the motions allow: another program verifies this")
+    yield f"- SHA-256 {claim['sha256']}"
+    signals = [f"p{k}" for k in range(1, len(claim["signals"]) + 1)]
+    for i, name in enumerate(states):
+        row = [*claim["A"][i], *claim["B"][i], *(signal["column"][i][0] for signal in claim["signals"])]
+        yield from _wrapped(f"- d/dt {name} = {_row(row, [*states, *inputs, *signals])}", [], "")
+    halves = [
+        f"that of {of} in d/dt {name} by {_number(half)}"
+        for name, *rows in zip(states, claim["half_A"], claim["half_B"], strict=True)
+        for of, half in zip((*states, *inputs), (*rows[0], *rows[1]), strict=True)
+        if _value(half)
+    ]
+    if halves:
+        yield from _wrapped("- coefficients vary at most: ", halves, ", ")
+    for k, signal in enumerate(claim["signals"], 1):
+        along = ""
+        if "along" in signal:
+            power = _row(signal["along"][0], [*states, *inputs])
+            along = f", and p{k} · ({power}) ≥ {_number(signal['least'])} p{k}²"
+        yield from _wrapped(f"- p{k} is unknown: |p{k}| ≤ 1{along}", [], "")
 
 
 def _motion(name: str, corners: Sequence[Table], document: Table) -> Iterator[str]:

@@ -16,9 +16,11 @@ from noack.scenario.scenario_file import load
 from noack.theory.witnesses.coordinates import floats
 from noack_check.__main__ import check_file
 from noack_check.check import RejectedError
-from noack_check.equations import enclose, equation_lines
+from noack_check.equation_text import equation_lines
 from noack_check.keys import RefusedError
 from noack_check.loop import Region
+from noack_equations import RejectedError as RejectedEquationsError
+from noack_equations import enclose
 from tests.checker.proofs import proved
 from tests.checker.traced_plants import Field, Plant, unexplained
 from tests.oracles.attacked_regions import SCENARIOS, largest_shares, largest_sizes, pendulum
@@ -116,7 +118,7 @@ def test_what_is_not_noted_has_no_enclosure(name: str) -> None:
     ],
 )
 def test_wrong_equations_are_rejected(steps: Any, rates: Any, reason: str) -> None:
-    with pytest.raises(RejectedError, match=reason):
+    with pytest.raises(RejectedEquationsError, match=reason):
         enclose({"steps": steps, "rates": rates}, Region((arb(2),), (arb(1),)))
 
 

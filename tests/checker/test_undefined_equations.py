@@ -15,9 +15,8 @@ from noack.core.errors import ExitStatus
 from noack.plants.systems.traced_equations import NotEnclosedError, trace
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
-from noack_check.check import RejectedError
-from noack_check.equations import enclose
 from noack_check.loop import Region
+from noack_equations import RejectedError, enclose
 from tests.checker.traced_plants import Plant, unexplained
 
 CASES = Path(__file__).parent.parent / "cases"

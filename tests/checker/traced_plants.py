@@ -7,7 +7,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.witnesses.coordinates import floats
-from noack_check.equations import LinearPlants
+from noack_equations import LinearPlants
 
 Field = Callable[[Any, Any], Any]
 

@@ -154,6 +154,7 @@ def test_the_wheel_contains_the_packages_and_their_data_only(dist: Path) -> None
         "noack_check",
         "noack_kernel",
         "noack_gains",
+        "noack_equations",
         "noack_verify",
     )
     for package in packages:

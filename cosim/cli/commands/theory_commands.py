@@ -61,6 +61,14 @@ def certify(
             help="Write the certificates for MATLAB and Octave (.mat).",
         ),
     ] = None,
+    equations: Annotated[
+        Path | None,
+        Option(
+            callback=opt.usable_path,
+            help="Write the plant's equations that the document is about to this file, for noack-check "
+            "--equations.",
+        ),
+    ] = None,
     document: Annotated[
         Path | None,
         Option(
@@ -109,13 +117,18 @@ def certify(
     from cosim.output.requirements import uncovered_as_unmet, unmet_by_scenario
     from cosim.record.run_directory import write_output
     from noack.core.file_access import require_suffix
+    from noack.scenario.resolution import resolve
     from noack.theory.witnesses.effort import MOST_WORK
 
     if out is not None:
         require_suffix(out, "--out", ".mat")
+    if equations is not None and document is None:
+        raise CallerError("--equations: they are those of a document; add --document FILE and --proof FILE")
     if (document is None) != (proof is None):
         raise CallerError("--document and --proof: noack-check needs both files; add the other option")
     loaded = opt.load_loop(scenario, settings, loop, network)
+    if equations is not None and resolve(loaded).coverage.is_linear:
+        raise CallerError("--equations: the plant is linear; its statements need no file of equations")
     with uncovered_as_unmet(require or ()):
         result = certificates_of(loaded, late)
     with work_bar("finding and verifying proofs" if search else "verifying proofs", lines=True) as bar:
@@ -125,7 +138,11 @@ def certify(
         files.verify()
         write_output(document, files.document)
         write_output(proof, files.proof)
-        print_to_stderr(f"noack: wrote {document} and {proof}; noack-check {document} {proof} verifies them")
+        command = f"noack-check {document} {proof}{'' if equations is None else f' --equations {equations}'}"
+        print_to_stderr(f"noack: wrote {document} and {proof}; {command} verifies them")
+    if equations is not None and witnesses.are_any:
+        write_output(equations, witnesses.equations_text())
+        print_to_stderr(f"noack: wrote {equations}; compare it with the plant's code")
     if search:
         with work_bar("trying smaller thresholds", lines=True) as bar:
             result.advise(bar)

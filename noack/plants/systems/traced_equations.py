@@ -2,7 +2,7 @@
 
 The equations are called with numbers that note what is done with them, on a region: which case of a
 comparison holds there becomes a step that the checker verifies. Each step is enclosed at once, by
-:mod:`noack_check.equations`, which has the argument.
+:mod:`noack_equations`, which has the argument.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,17 +14,17 @@ from noack.core.errors import NoackError, one_line, shortened
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import PlantSystem
 from noack_check.balls import number
-from noack_check.check import RejectedError
-from noack_check.equations import (
+from noack_check.equation_text import formulas
+from noack_equations import (
     SIGNALS,
     Enclosed,
     Evaluation,
     LinearPlants,
+    Region,
+    RejectedError,
     UndefinedError,
     enclose,
-    formulas,
 )
-from noack_check.loop import Region
 
 Operand: TypeAlias = "TracedNumber | float"
 _MOST_SIGNALS = 16
@@ -46,7 +46,7 @@ class TracedEquations(NamedTuple):
     """Equations on a region."""
 
     document: Mapping[str, object]
-    """Their steps, as :func:`noack_check.equations.enclose` reads them."""
+    """Their steps, as :func:`noack_equations.enclose` reads them."""
     plants: LinearPlants
     """What encloses them."""
 

@@ -22,8 +22,8 @@ from noack.theory.witnesses.documents import (
     witness_by_gains,
 )
 from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
-from noack_check.equations import read_region
 from noack_check.loop import Loop
+from noack_check.scenario import read_region
 
 _FIRST = 0.1
 """The first region, in multiples of what decides which coordinates it restricts."""

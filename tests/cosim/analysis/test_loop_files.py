@@ -89,7 +89,7 @@ def test_files_that_cannot_be_read_are_named(
     status, output = noack_check(capsys, *files, "--scenario", none)
     assert (status, output.splitlines()[-1]) == (
         2,
-        "noack-check: error: a loop document needs neither --scenario nor --equations",
+        "noack-check: error: a loop document needs no --scenario",
     )
 
 
@@ -136,6 +136,37 @@ def test_noack_check_proves_bounds_by_gains(tmp_path: Path, capsys: pytest.Captu
     assert json.loads(invoke("check", "lane_5g_urban", "--document", "--json").output)["losses"] == 0
     loop.write_text(loop.read_text().replace('"losses":0', '"losses":1'))
     assert noack_check(capsys, loop, proof) == (1, f"REJECTED {OF_ANOTHER}\n")
+
+
+def test_noack_check_proves_what_a_plants_equations_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both programs are named; without the equations the statement is about the document only."""
+    loop, proof, equations = (tmp_path / name for name in ("loop.json", "proof.json", "equations.txt"))
+    options = ("--no-search", "--document", loop, "--proof", proof, "--equations", equations)
+    result = invoke("certify", "sine_pendulum", *options)
+    assert result.exit_code == ExitStatus.OK, result.output
+    assert f"noack-check {loop} {proof} --equations {equations} verifies them" in result.stderr
+    status, output = noack_check(capsys, loop, proof, "--equations", equations)
+    assert status == ExitStatus.OK
+    assert "PROVED |angle| ≤ 0.519534" in output
+    assert "PROVED the document allows all that the equations with the SHA-256" in output
+    assert "lines of Python verified" in output
+    assert "further lines verified" in output
+    status, output = noack_check(capsys, loop, proof)
+    assert status == ExitStatus.OK
+    assert "This is about the document only." in output
+    assert "d/dt rate = 9.569 angle − 0.1 rate + u0" in invoke("check", "sine_pendulum", "--document").output
+    equations.write_text(equations.read_text().replace("9.81", "9.82"))
+    status, output = noack_check(capsys, loop, proof, "--equations", equations)
+    assert status == 1
+    assert output.splitlines()[-1].startswith("REJECTED the document is about equations with the SHA-256")
+
+
+def test_equations_are_written_beside_a_document_only(tmp_path: Path) -> None:
+    result = invoke("certify", "sine_pendulum", "--no-search", "--equations", tmp_path / "equations.txt")
+    assert result.exit_code == ExitStatus.CALLER
+    assert "add --document FILE and --proof FILE" in result.stderr
 
 
 def test_each_shipped_proof_has_its_file() -> None:

@@ -23,16 +23,13 @@ out of the plant; sign has no largest slope.
 So f(z) = (A + Δ)z + Σ column p + c, with entries of Δ in boxes.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from flint import arb, arb_mat
+from flint import arb, arb_mat, ctx
 
-from noack_check.balls import around_zero, frobenius
-from noack_check.check import RejectedError
-from noack_check.document import read_number, read_table
-from noack_check.loop import Along, Region
-
+ctx.prec = 128  # bits of midpoints
 MOST_STEPS = 5000
 SIGNALS = ("sign", "tanh", "arctan", "clip")
 """Steps that may be unknown signals."""
@@ -51,6 +48,24 @@ _UNDEFINED = {
     "root": "root of a number that may be negative",
     "tan": "tan of an angle that may be π/2",
 }
+
+
+class RejectedError(ValueError):
+    """Equations have no meaning or no enclosure, or a document does not allow what they do."""
+
+
+class Along(NamedTuple):
+    """A signal p has p·C(x, u) ≥ k p², as friction that takes energy out of the plant."""
+
+    row: arb_mat  # C, (1, n + m); 0: nothing is known
+    least: arb  # k ≥ 0
+
+
+class Region(NamedTuple):
+    """|x_i| < x[i] and |u_j| < u[j]: where a plant's equations are enclosed; None: any value."""
+
+    x: tuple[arb | None, ...]
+    u: tuple[arb | None, ...]
 
 
 class UndecidedError(RejectedError):
@@ -118,9 +133,9 @@ class Evaluation:
             UndefinedError: it is not proven to be finite on the whole region.
         """
         shape = len(operands), len(numbers)
-        if name in _FUNCTIONS and shape == (1, 0):
-            term = self._function(operands[0], *_FUNCTIONS[name])
-        elif name in _SHAPES and _SHAPES[name] == shape:
+        if name in FUNCTIONS and shape == (1, 0):
+            term = self._function(operands[0], *FUNCTIONS[name])
+        elif name in SHAPES and SHAPES[name] == shape:
             term = getattr(self, f"_{name}")(*operands, *numbers)
         else:
             raise RejectedError(f"equations: {name[:50]!r} is no step of such a shape")
@@ -139,7 +154,7 @@ class Evaluation:
         """Return terms whose squares add up to a step; none: no such terms are known."""
         if name == "power" and numbers[0] == 2:
             return (operands[0],)
-        if name == "number" and (value := read_number({"number": numbers[0]}, "number")) >= 0:
+        if name == "number" and (value := _finite(numbers[0])) >= 0:
             return (self._constant(value.sqrt()),)
         if name == "add" and all(operand.squares for operand in operands):
             return operands[0].squares + operands[1].squares
@@ -166,7 +181,7 @@ class Evaluation:
         return Enclosed(arb(0), slopes, arb(0), self._z[index])
 
     def _number(self, value: float | None) -> Enclosed:
-        return self._constant(read_number({"number": value}, "number"))
+        return self._constant(_finite(value))
 
     def _time(self) -> Enclosed:
         return self._constant(arb(_LONGEST_S / 2, _LONGEST_S / 2))
@@ -200,7 +215,7 @@ class Evaluation:
         return width if width.is_finite() else arb(1e300)
 
     def _power(self, a: Enclosed, exponent: float | None) -> Enclosed:
-        power = float(read_number({"exponent": exponent}, "exponent"))
+        power = float(_finite(exponent))
         if abs(power) > _MOST_POWER:
             raise RejectedError("equations: an exponent is too large")
         if power == 0:
@@ -253,8 +268,7 @@ class Evaluation:
     def _clip(self, a: Enclosed, low: float | None, high: float | None) -> Enclosed:
         """Return min(max(g, low), high); None: without this limit."""
         least, most = (
-            arb(sign * float("inf")) if end is None else read_number({"limit": end}, "limit")
-            for sign, end in ((-1, low), (1, high))
+            arb(sign * float("inf")) if end is None else _finite(end) for sign, end in ((-1, low), (1, high))
         )
 
         def value(g: arb) -> arb:
@@ -396,7 +410,7 @@ def _is_nonnegative(name: str, operands: Sequence[Enclosed], numbers: Sequence[f
     if name in ("add", "times"):
         return all(operand.is_nonnegative for operand in operands)
     if name == "number":
-        return bool(read_number({"number": numbers[0]}, "number") >= 0)
+        return bool(_finite(numbers[0]) >= 0)
     if name == "power":
         return operands[0].is_nonnegative or float(numbers[0] or 0) % 2 == 0
     if name == "clip":
@@ -464,7 +478,7 @@ def _exp(g: arb) -> arb:
     return _at_ends(g, lambda end: end.exp())
 
 
-_FUNCTIONS: Mapping[str, tuple[Callable[[arb], arb], Callable[[arb], arb]]] = {
+FUNCTIONS: Mapping[str, tuple[Callable[[arb], arb], Callable[[arb], arb]]] = {
     "sin": (lambda g: g.sin(), lambda g: g.cos()),
     "cos": (lambda g: g.cos(), lambda g: -g.sin()),
     "tan": (_tan, lambda g: 1 / _power(g.cos(), 2)),
@@ -476,7 +490,7 @@ _FUNCTIONS: Mapping[str, tuple[Callable[[arb], arb], Callable[[arb], arb]]] = {
 }
 """Functions with their derivatives."""
 _NONNEGATIVE = ("abs", "exp", "cosh", "root", "time")
-_SHAPES = {
+SHAPES = {
     "state": (0, 1), "input": (0, 1), "number": (0, 1), "time": (0, 0), "add": (2, 0), "times": (2, 0),
     "negative": (1, 0), "power": (1, 1), "clip": (1, 2), "sign": (1, 0), "positive": (1, 0),
     "nonnegative": (1, 0), "tanh": (1, 0), "arctan": (1, 0), "root": (1, 0),
@@ -503,7 +517,7 @@ def enclose(equations: Mapping[str, object], region: Region) -> LinearPlants:
     evaluation = Evaluation(region, sum(step[0] in SIGNALS for step in steps))
     done: list[Enclosed] = []
     for name, *rest in steps:
-        count = 1 if name in _FUNCTIONS else _SHAPES.get(name, (0, 0))[0]
+        count = 1 if name in FUNCTIONS else SHAPES.get(name, (0, 0))[0]
         operands = [_earlier(done, index) for index in rest[:count]]
         done.append(evaluation.step(name, operands, rest[count:]))
     if not isinstance(rates, list) or len(rates) != len(region.x):
@@ -517,70 +531,31 @@ def _earlier(done: Sequence[Enclosed], index: object) -> Enclosed:
     return done[index]
 
 
-def read_region(document: Mapping[str, object], n: int, m: int) -> Region:
-    """Return the region of a document."""
-    table = read_table(document, "region")
+def region_of(x: Sequence[object], u: Sequence[object]) -> Region:
+    """Return a region from its sizes, of which None is no limit."""
     found = []
-    for key, count in (("x", n), ("u", m)):
-        sizes = table.get(key)
-        if not isinstance(sizes, list) or len(sizes) != count:
-            raise RejectedError(f"region: not {count} sizes of {key}")
-        limits = [None if size is None else read_number({"region": size}, "region") for size in sizes]
+    for sizes in (x, u):
+        limits = [None if limit is None else _finite(limit) for limit in sizes]
         if not all(limit is None or limit > 0 for limit in limits):
             raise RejectedError("region: a size is not above 0")
         found.append(tuple(limits))
     return Region(*found)
 
 
-def equation_lines(equations: Mapping[str, object]) -> list[str]:
-    """Return equations, as :func:`enclose` accepts them, as text: a line for each step and each rate."""
-    steps, rates, names, lines = equations["steps"], equations["rates"], list[str](), list[str]()
-    assert isinstance(steps, list)
-    assert isinstance(rates, list)
-    for name, *rest in steps:
-        formula = _formula(name, rest, names)
-        if name in ("positive", "nonnegative"):
-            lines.append(f"{formula} {'>' if name == 'positive' else '≥'} 0")
-        elif name not in ("state", "input", "time", "number"):
-            plain = formula[1:-1] if formula.startswith("(") else formula
-            lines.append(f"s_{len(names) + 1} = {plain}")
-            formula = f"s_{len(names) + 1}"
-        names.append(formula)
-    return lines + [f"dx_{i + 1}/dt = {names[index]}" for i, index in enumerate(rates)]
+def _finite(value: object) -> arb:
+    """Return a finite number; a float is the exact binary value that it has."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise RejectedError("equations: not a number")
+    if (isinstance(value, int) and abs(value) > 2**63) or not math.isfinite(value):
+        raise RejectedError("equations: not finite, or too large")
+    return arb(value)
 
 
-_INFIX = {"add": " + ", "times": " · "}
+def around_zero(radius: arb) -> arb:
+    """Return the ball of all numbers of at most this size."""
+    return arb(0, radius.abs_upper())
 
 
-def formulas(equations: Mapping[str, object]) -> list[str]:
-    """Return the rates of equations, as :func:`enclose` accepts them, in words of mathematics."""
-    steps, texts = equations["steps"], list[str]()
-    assert isinstance(steps, list)
-    for name, *rest in steps:
-        texts.append(_formula(name, rest, texts)[:_LONGEST_FORMULA])
-    rates = equations["rates"]
-    assert isinstance(rates, list)
-    return [texts[index] for index in rates]
-
-
-_LONGEST_FORMULA = 2000
-
-
-def _formula(name: str, rest: Sequence[object], texts: Sequence[str]) -> str:
-    count = 1 if name in _FUNCTIONS else _SHAPES[name][0]
-    operands = [texts[index] for index in rest[:count] if isinstance(index, int)]
-    if name in ("state", "input"):
-        return f"{'x' if name == 'state' else 'u'}_{int(str(rest[0])) + 1}"
-    if name == "number":
-        return repr(rest[0])
-    if name == "time":
-        return "t"
-    if name in _INFIX:
-        return f"({_INFIX[name].join(operands)})"
-    if name == "negative":
-        return f"(−{operands[0]})"
-    if name in ("positive", "nonnegative"):
-        return operands[0]
-    if name == "root":
-        return f"sqrt({operands[0]})"
-    return f"{name}({', '.join([*operands, *map(str, rest[count:])])})"
+def frobenius(M: arb_mat) -> arb:
+    """Return the root of the sum of squares of the entries."""
+    return arb(sum((entry * entry for entry in M.entries()), arb(0)).upper()).sqrt()
