@@ -15,7 +15,8 @@ with |Δ_ik| ≤ h_ik, |p_s| ≤ 1, and p_s · C_s z ≥ k_s p_s² where a signa
 * E3, the copies. Errors e = G(x_s − x) with a copy x_s that no signal moves: their rows are −G times those of
   the states, plus rows that are exact; and so are the columns of the signals.
 * E4, nothing else: all other rows of these signals are exactly 0. Further unknown signals may be there; they
-  are no part of the equations, and the sentence says how many.
+  are no part of the equations, and the sentence says how many. Edges leave the states as they are, since the
+  plant's state is continuous, and take no time, in which nothing would be compared.
 
 What is added to the document's numbers are intervals; an entry has to contain what is needed.
 """
@@ -32,7 +33,7 @@ from noack_equations.enclosure import LinearPlants, Region, RejectedError, enclo
 from noack_equations.text import block_of, steps_of
 from noack_gains import Document as DocumentOfGains
 from noack_gains import RejectedError as RejectedByGainsError
-from noack_kernel.document import Corner, Document, Table, entries, fields, strings
+from noack_kernel.document import FORMAT, Corner, Document, Table, entries, fields, read_table, strings
 from noack_kernel.exact import Matrix, rational, read_matrix, unit_rows
 from noack_kernel.exact import RejectedError as RejectedByKernelError
 
@@ -106,6 +107,7 @@ def prove_equations(document: str, equations: str) -> Proven:
         region = region_of_limits(loop, claim)
         steps = steps_of(block_of(equations, claim.digest))
         _require_enclosed(claim, enclose(steps, region))
+        _require_still_edges(loop, claim, document)
         further = [
             _require_allowed(loop, claim, name, corner)
             for name, corners in loop.motions.items()
@@ -311,6 +313,17 @@ class _Expected(NamedTuple):
     rows: Matrix
     along: Matrix | None
     least: fmpq
+
+
+def _require_still_edges(document: Document, claim: Claim, text: str) -> None:
+    """E4: no edge changes a state, or takes time."""
+    for edge in document.edges:
+        for index in claim.states if edge.target is not None else ():
+            if not edge.jump.has_row(index, {index: fmpq(1)}):
+                name = document.coordinates[index]
+                raise RejectedError(f"equations: edge {edge.name}: it changes the state {name!r}")
+    if any("duration" in entry for entry in entries(read_table(text, FORMAT)["edges"], "edges")):
+        raise RejectedError("equations: an edge takes time, in which nothing is compared")
 
 
 def _with_one_input(claim: Claim, name: str, corners: tuple[Corner, ...]) -> tuple[Corner, ...]:

@@ -156,6 +156,10 @@ FALSE: dict[str, tuple[Callable[[Table, str], str], str]] = {
         in_all_corners(lambda c: c["unknown"][0]["column"].__setitem__(3, [0])),
         r"the entry A\[1, 0\] is not that",
     ),
+    "an edge that changes a state": (
+        lambda d, e: d["edges"][0]["jump"][0].__setitem__(0, 0.99) or e, "it changes the state 'angle'",
+    ),
+    "an edge that takes time": (lambda d, e: d["edges"][0].update(duration=0.01) or e, "duration|takes time"),
     "a signal that takes energy": (
         in_all_corners(lambda c: c["unknown"][0].update(along=[[0] * len(c["matrix"])], least=0)),
         "it is not known to take so much",
