@@ -44,6 +44,22 @@ def files_of_widest(resolved: Scenario, witnesses: Witnesses) -> ProofFiles | Ga
         raise CallerError(f"there is no document: {error}") from None
 
 
+def gains_of_widest(resolved: Scenario, witnesses: Witnesses) -> GainsFiles | None:
+    """Return the files of the bounds by gains that a statement has beside its forms; None: it has none.
+
+    Raises:
+        CallerError: nothing is proven.
+    """
+    statement = widest(witnesses)
+    loop, document = _proven(statement)
+    if not document.get("bounds") or "gains" not in document:
+        return None
+    try:
+        return gains_files(loop, document, naming_of(resolved, statement))
+    except NoDocumentError:
+        return None
+
+
 def _proven(statement: WitnessedStatement) -> tuple[Loop, dict[str, object]]:
     if statement.document is None or statement.loop is None:
         raise CallerError(f"there is no proof: {statement.reason}")

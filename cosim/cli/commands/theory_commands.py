@@ -81,7 +81,8 @@ def certify(
         Path | None,
         Option(
             callback=opt.usable_path,
-            help="Write the proof of the document's bounds to this file (.json), for noack-check.",
+            help="Write the proof of the document's bounds to this file (.json), for noack-check. If some "
+            "bounds are smaller by small gains, a second pair of files has these: FILE.gains.json.",
         ),
     ] = None,
     search: Annotated[
@@ -110,7 +111,7 @@ def certify(
     Each bound was verified by noack-check. What is found is kept in the cache folder of the user.
     """
     from cosim.analysis.certificates import certificates_of
-    from cosim.analysis.loop_files import files_of_widest
+    from cosim.analysis.loop_files import files_of_widest, gains_of_widest
     from cosim.live.monitoring.progress import work_bar
     from cosim.output.certificate_report import certificate_document
     from cosim.output.export.mat_export import save_mat
@@ -140,6 +141,15 @@ def certify(
         write_output(proof, files.proof)
         command = f"noack-check {document} {proof}{'' if equations is None else f' --equations {equations}'}"
         print_to_stderr(f"noack: wrote {document} and {proof}; {command} verifies them")
+        if (more := gains_of_widest(result.scenario, witnesses)) is not None:
+            more.verify()
+            pair = [path.with_suffix(f".gains{path.suffix}") for path in (document, proof)]
+            for path, content in zip(pair, (more.document, more.proof), strict=True):
+                write_output(path, content)
+            print_to_stderr(
+                f"noack: wrote {pair[0]} and {pair[1]}, of bounds by small gains; "
+                f"noack-check {pair[0]} {pair[1]} verifies them"
+            )
     if equations is not None and witnesses.are_any:
         write_output(equations, witnesses.equations_text())
         print_to_stderr(f"noack: wrote {equations}; compare it with the plant's code")
