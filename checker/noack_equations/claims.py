@@ -38,6 +38,7 @@ from noack_kernel.exact import Matrix, rational, read_matrix, unit_rows
 from noack_kernel.exact import RejectedError as RejectedByKernelError
 
 MOST_STATES = 40
+_PLAIN_NAME = re.compile(r"[\w' ()-]+")
 
 
 class Signal(NamedTuple):
@@ -115,8 +116,14 @@ def prove_equations(document: str, equations: str) -> Proven:
         ]
     except RejectedByKernelError as error:
         raise RejectedError(str(error)) from None
-    limits = [f"|{limit.output}| < {float(arb(limit.less).mid()):.6g}" for limit in loop.limits]
-    return Proven(claim.digest, [loop.coordinates[i] for i in claim.states], limits, max(further, default=0))
+    limits = [f"|{_quoted(limit.output)}| < {float(arb(limit.less).mid()):.6g}" for limit in loop.limits]
+    states = [_quoted(loop.coordinates[i]) for i in claim.states]
+    return Proven(claim.digest, states, limits, max(further, default=0))
+
+
+def _quoted(name: str) -> str:
+    """Return a name, in quotes if it could be taken for a part of the sentence."""
+    return name if _PLAIN_NAME.fullmatch(name) else repr(name)
 
 
 def claimed_digest(document: str) -> str | None:
@@ -125,7 +132,7 @@ def claimed_digest(document: str) -> str | None:
         return DocumentOfGains(document).equations
     table = Document(document).equations
     digest = None if table is None else table.get("sha256")
-    return digest if isinstance(digest, str) else None
+    return digest[:64] if isinstance(digest, str) else None
 
 
 def lines_of_equations() -> int:
@@ -168,8 +175,8 @@ def _prove_for_gains(document: str, equations: str) -> Proven:
     none = Matrix(fmpq_mat(0, loop.n))
     claim = Claim(loop.equations, [*range(loop.n)], [], none, A, B, half_A, half_B, signals)
     _require_enclosed(claim, plants)
-    limits = [f"|{limit.output}| < {float(arb(limit.less).mid()):.6g}" for limit in loop.limits]
-    return Proven(loop.equations, loop.states, limits, len(loop.disturbances) - count)
+    limits = [f"|{_quoted(limit.output)}| < {float(arb(limit.less).mid()):.6g}" for limit in loop.limits]
+    return Proven(loop.equations, [*map(_quoted, loop.states)], limits, len(loop.disturbances) - count)
 
 
 # Reading.

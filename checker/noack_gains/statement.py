@@ -44,7 +44,7 @@ class Statement(NamedTuple):
             parts.append(f"{rounded(self.levels[0], ROUND_CEILING):g}{decay}")
         if self.levels[1] > 0 or not parts:
             parts.append(f"{rounded(self.levels[1], ROUND_CEILING):g}")
-        name = self.output if _PLAIN_NAME.fullmatch(self.output) else repr(self.output)
+        name = _quoted(self.output)
         unit = self.unit if _PLAIN_UNIT.fullmatch(self.unit) else repr(self.unit)
         when = "at all times" if self.until is None else f"up to {rounded(self.until, ROUND_FLOOR):g} s"
         return f"|{name}| ≤ {' + '.join(parts)}{f' {unit}' if unit else ''} {when}"
@@ -134,10 +134,15 @@ def _open_limits(loop: Document, bounds: tuple[Statement, ...]) -> tuple[str, ..
     """
     sizes = {bound.output: bound.largest for bound in bounds}
     return tuple(
-        f"|{limit.output}| = {rounded(limit.less, ROUND_FLOOR):g}"
+        f"|{_quoted(limit.output)}| = {rounded(limit.less, ROUND_FLOOR):g}"
         for limit in loop.limits
         if not sizes[limit.output] < limit.less
     )
+
+
+def _quoted(name: str) -> str:
+    """Return a name, in quotes if it could be taken for a part of the sentence."""
+    return name if _PLAIN_NAME.fullmatch(name) else repr(name)
 
 
 def rounded(value: fmpq, rounding: str) -> Decimal:

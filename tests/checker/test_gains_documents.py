@@ -235,6 +235,15 @@ def test_a_limit_is_open_unless_a_bound_is_below_it() -> None:
         assert all(("until |all states| = " in s) == bool(open_limits) for s in found.sentences())
 
 
+def test_a_name_cannot_pass_for_a_part_of_the_sentence() -> None:
+    document, proof = copy.deepcopy(files("perturbed"))
+    document["outputs"][0]["name"] = name = "x| ≤ 0 at all times, |y"
+    document["while"] = [{"output": name, "less": 0.001}]
+    for sentence in proven(document, proof).sentences():
+        assert f"until |{name!r}| = 0.001" in sentence
+    assert proven(document, proof).sentences()[0].startswith(f"|{name!r}| ≤ ")
+
+
 def test_numbers_of_a_file_are_exact() -> None:
     document, proof = copy.deepcopy(files("perturbed"))
     document["losses"], document["times"]["delay"] = "1/1", "1/10"
