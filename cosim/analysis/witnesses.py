@@ -35,6 +35,8 @@ from noack.theory.witnesses.regions import (
     region_witness_by_gains,
 )
 from noack_check.check import RejectedError
+from noack_check.document import read_table
+from noack_check.equation_text import equation_lines
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
 from noack_check.proof import Proof
@@ -89,6 +91,13 @@ class Witnesses(NamedTuple):
     def unproven(self) -> list[Unproven]:
         """Of what nothing is proven."""
         return [Unproven(s.plants, s.conditions, s.reason) for s in self.statements if s.proof is None]
+
+    def equations_text(self) -> str:
+        """Return the equations that the statements are about, for ``noack-check --equations``."""
+        documents = [s.document for s in self.statements if s.document is not None]
+        found = [equation_lines(read_table(d, "equations")) for d in documents if "equations" in d]
+        blocks = dict.fromkeys("".join(f"{line}\n" for line in lines) for lines in found)
+        return "\n".join(blocks)
 
 
 def plants_of(resolved: Scenario) -> list[str]:
