@@ -4,6 +4,6 @@ It imports nothing of noack. ``docs/proof-format.md`` describes both formats and
 """
 
 from noack_kernel.exact import RejectedError
-from noack_kernel.statement import Proven, Statement, prove
+from noack_kernel.statement import GrowthStatement, Proven, Statement, prove
 
-__all__ = ["Proven", "RejectedError", "Statement", "prove"]
+__all__ = ["GrowthStatement", "Proven", "RejectedError", "Statement", "prove"]

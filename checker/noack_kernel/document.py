@@ -2,7 +2,8 @@
 
 z is the vector of the document's coordinates. In a location z moves as the corners of a motion say, and a
 clock runs. An edge may be taken while the clock is in an interval and the edge's facts hold; it sets
-z := J z. A fact is an inequality Σ|Rz|² ≤ Σ|R'z|². Nothing here knows a trigger, a network or a scenario.
+z := J z. An edge may last some time: then J is a product of steps (:mod:`.jumps`). A fact is an inequality
+Σ|Rz|² ≤ Σ|R'z|². Nothing here knows a trigger, a network or a scenario.
 """
 
 import hashlib
@@ -11,24 +12,30 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from flint import fmpq
+from flint import fmpq, fmpq_mat
 
 from noack_kernel.exact import (
     Matrix,
     RejectedError,
     beside,
+    decay_below,
     decimal,
+    product,
     rational,
     read_matrix,
     square,
+    unit_rows,
     whole,
     zeros,
 )
+from noack_kernel.jumps import Products, Step
 
 FORMAT = "noack-hybrid 1"
 MOST_BYTES = 64 * 2**20
 MOST_COORDINATES, MOST_LOCATIONS, MOST_EDGES, MOST_NODES = 60, 200, 2000, 64
 MOST_SIGNALS = 200
+MOST_STEPS = 1000
+"""Of an edge."""
 MOST_NAME = 200
 MOST_TEXT = 2000
 Table = Mapping[str, object]
@@ -60,6 +67,18 @@ class Corner:
             found = beside(found, each.column)
         return found
 
+    @cached_property
+    def squares(self) -> list[tuple[Matrix, Matrix | None]]:
+        """|p|² − |Rz|² of each signal, and 2 k p² − 2 p·Cz if it goes along with a row, on (z, p)."""
+        size, found = self.matrix.height, list[tuple[Matrix, Matrix | None]]()
+        z = unit_rows(range(size), size + len(self.unknown))
+        for index, signal in enumerate(self.unknown):
+            p, along = unit_rows([size + index], z.width), None
+            if signal.along is not None:
+                along = square(p).times(2 * signal.least) - product(p, signal.along @ z)
+            found.append((square(p) - square(signal.rows @ z), along))
+        return found
+
 
 @dataclass(frozen=True)
 class Location:
@@ -71,6 +90,7 @@ class Location:
     clock: fmpq | None
     """The largest value of the clock, s; None: no limit."""
     motion: tuple[Corner, ...]
+    """Empty: no time passes here, and the clock is 0."""
     facts: tuple[str, ...]
 
 
@@ -90,6 +110,10 @@ class Edge:
     jump: Matrix
     event: bool
     """Whether it counts as an event: a statement about the time between two events is about such edges."""
+    steps: tuple[Step, ...]
+    """What happens during an edge, in order of time; ``jump`` is their product. Empty: it does not last."""
+    duration: fmpq
+    """How long the edge lasts, s."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +126,8 @@ class Output:
     velocity: Matrix | None
     input: int | None
     locations: tuple[str, ...]
+    during_edges: bool = False
+    """Whether it is bounded during the edges that last, too."""
 
 
 @dataclass(frozen=True)
@@ -135,12 +161,8 @@ class Document:
             "edges",
             "start",
         }
-        fields(
-            table,
-            "document",
-            required | {"outputs"},
-            {"decaying", "constant", "readings", "while", "about", "equations"},
-        )
+        optional = {"decaying", "constant", "readings", "while", "about", "equations", "steps"}
+        fields(table, "document", required | {"outputs"}, optional)
         self.digest = hashlib.sha256(text.encode()).hexdigest()
         self.name = name_of(table["name"], "name")
         self.coordinates, self.units_of, self.noise = self._read_coordinates(table["coordinates"])
@@ -153,11 +175,15 @@ class Document:
         self.facts = {name: self._fact(name, f) for name, f in mapping(table["facts"], "facts").items()}
         motions = mapping(table["motions"], "motions")
         self.motions = {name: self._motion(name, corners) for name, corners in motions.items()}
+        self.products = Products(self.size)
+        steps = mapping(table.get("steps", {}), "steps")
+        self.steps = {name: self._read_step(name, mapping(value, name)) for name, value in steps.items()}
         found = [self._location(entry) for entry in entries(table["locations"], "locations")]
         self.locations = {location.name: location for location in found}
         self.edges = [self._edge(entry) for entry in entries(table["edges"], "edges")]
         _unique([location.name for location in found], "locations", MOST_LOCATIONS)
         _unique([edge.name for edge in self.edges], "edges", MOST_EDGES)
+        self._require_time_to_pass()
         self._read_start(table["start"])
         outputs = [self._output(entry) for entry in entries(table["outputs"], "outputs")]
         _unique([output.name for output in outputs], "outputs")
@@ -220,7 +246,7 @@ class Document:
         fields(entry, f"fact {name}", {"less", "more", "words"})
         self.words[name] = text_of(entry["words"], name)
         for side, sign in (("less", 1), ("more", -1)):
-            for rows in _known(entry[side], self.rows, f"fact {name}"):
+            for rows in names_of(entry[side], self.rows, f"fact {name}"):
                 total += square(self.rows[rows]).times(fmpq(sign))
         return total
 
@@ -275,8 +301,12 @@ class Document:
         inside = {self._state(each) for each in strings(entry["coordinates"], f"location {name}")} | {
             *self.units
         }
-        (motion,) = _known([entry["motion"]], self.motions, f"location {name}")
-        facts = _known(entry["facts"], self.facts, f"location {name}")
+        facts = names_of(entry["facts"], self.facts, f"location {name}")
+        if entry["motion"] is None:
+            if clock not in (None, 0):
+                raise RejectedError(f"location {name}: no time passes, and the clock is above 0")
+            return Location(name, tuple(sorted(inside)), fmpq(0), (), facts)
+        (motion,) = names_of([entry["motion"]], self.motions, f"location {name}")
         outside = [i for i in self.states if i not in inside]
         for corner in self.motions[motion]:
             moved = corner.matrix.is_zero(outside, [*inside, *self.noise])
@@ -287,11 +317,12 @@ class Document:
     def _edge(self, entry: Table) -> Edge:
         name = name_of(entry.get("name"), "edges")
         place = f"edge {name}"
-        fields(entry, place, {"name", "from", "to", "clock", "facts"}, {"when", "jump", "event"})
+        optional = {"when", "jump", "event", "duration"}
+        fields(entry, place, {"name", "from", "to", "clock", "facts"}, optional)
         event = entry.get("event", False)
         if not isinstance(event, bool):
             raise RejectedError(f"{place}: event is true or false")
-        (source,) = _known([entry["from"]], self.locations, place)
+        (source,) = names_of([entry["from"]], self.locations, place)
         end = self.locations[source].clock
         first, last = fmpq(0), end
         if entry.get("when") is not None:
@@ -301,35 +332,103 @@ class Document:
             first, last = rational(when[0]), rational(when[1])
             if not 0 <= first <= last or (end is not None and last > end):
                 raise RejectedError(f"{place}: when is not within the clock of {source}")
-        facts = _known(entry["facts"], self.facts, place)
+        facts = names_of(entry["facts"], self.facts, place)
         if entry["clock"] not in ("zero", "keeps", "any"):
             raise RejectedError(f"{place}: the clock is zero, keeps, or any")
         if entry["to"] is None:
-            if "jump" in entry:
+            if "jump" in entry or "duration" in entry:
                 raise RejectedError(f"{place}: an edge that leads nowhere has no jump")
-            jump = zeros(self.size, self.size)
-            return Edge(name, source, None, first, last, str(entry["clock"]), facts, jump, event)
-        (target,) = _known([entry["to"]], self.locations, place)
-        jump = self._jump(place, entry.get("jump"), self.locations[source], self.locations[target])
-        return Edge(name, source, target, first, last, str(entry["clock"]), facts, jump, event)
+            nothing, clock = zeros(self.size, self.size), str(entry["clock"])
+            return Edge(name, source, None, first, last, clock, facts, nothing, event, (), fmpq(0))
+        (target,) = names_of([entry["to"]], self.locations, place)
+        steps = self._steps(place, entry.get("jump"))
+        duration = sum((step.seconds for step in steps if step.seconds is not None), fmpq(0))
+        if rational(entry.get("duration", fmpq(0))) != duration:
+            raise RejectedError(f"{place}: the duration is not that of its steps")
+        J = self._product(steps) if steps else read_matrix(entry.get("jump"), self.size, self.size)
+        self._require_jump(place, J, duration, self.locations[source], self.locations[target])
+        return Edge(name, source, target, first, last, str(entry["clock"]), facts, J, event, steps, duration)
 
-    def _jump(self, place: str, rows: object, source: Location, target: Location) -> Matrix:
-        J = read_matrix(rows, self.size, self.size)
+    def _require_jump(
+        self, place: str, J: Matrix, duration: fmpq, source: Location, target: Location
+    ) -> None:
         outside = [i for i in self.states if i not in target.coordinates]
         if not J.is_zero(outside, [*source.coordinates, *self.noise]):
             raise RejectedError(f"{place}: a coordinate that {target.name} lacks is not 0 after it")
         if not J.is_zero(self.noise, range(self.size)):
             raise RejectedError(f"{place}: noise does not follow from a jump")
-        if not all(J.has_row(unit, {unit: fmpq(1)}) for unit in self.units):
-            raise RejectedError(f"{place}: a unit changes")
-        return J
+        for unit in self.units:
+            factor = J.mid[unit, unit] if unit == self.decaying and duration > 0 else fmpq(1)
+            if not J.has_row(unit, {unit: factor}):
+                raise RejectedError(f"{place}: a unit changes")
+            if unit == self.decaying and not 0 <= factor <= decay_below(self.rate, duration):
+                raise RejectedError(f"{place}: {self.coordinates[unit]} decays more slowly than at its rate")
+
+    # Steps of edges that last.
+
+    def _read_step(self, name: str, value: Table) -> Matrix:
+        fields(value, f"step {name}", {"matrix", "words"})
+        text_of(value["words"], f"step {name}")
+        return read_matrix(value["matrix"], self.size, self.size)
+
+    def _steps(self, place: str, value: object) -> tuple[Step, ...]:
+        """Return the steps of a jump; none if it is a matrix."""
+        if not isinstance(value, list) or not any(isinstance(each, str | dict) for each in value):
+            return ()
+        if len(value) > MOST_STEPS:
+            raise RejectedError(f"{place}: more than {MOST_STEPS} steps")
+        return tuple(self._step(place, each) for each in value)
+
+    def _step(self, place: str, value: object) -> Step:
+        """Return z := M z for the name of M, or z := e^{Fs} z. Noise and f2 keep their values meanwhile."""
+        if isinstance(value, dict):
+            fields(value, place, {"exp", "seconds"})
+            (name,), seconds = names_of([value["exp"]], self.steps, place), rational(value["seconds"])
+            if seconds < 0:
+                raise RejectedError(f"{place}: a time below 0")
+            if not self.steps[name].is_zero([*self.units, *self.noise], range(self.size)):
+                raise RejectedError(f"{place}: a unit or noise changes in {name}")
+            return Step(name, self.steps[name], seconds)
+        (name,) = names_of([value], self.steps, place)
+        M = self.steps[name]
+        decay = {} if self.decaying is None else {self.decaying: M.mid[self.decaying, self.decaying]}
+        if not all(M.has_row(i, {i: decay.get(i, fmpq(1))}) for i in (*self.units, *self.noise)):
+            raise RejectedError(f"{place}: a unit or noise changes in {name}")
+        return Step(name, M, None)
+
+    def _product(self, steps: Sequence[Step]) -> Matrix:
+        """Return the product of steps; the rows of units are exact, and noise does not follow from a jump."""
+        found = self.products.of(steps)
+        mid, radius = fmpq_mat(found.mid), None if found.radius is None else fmpq_mat(found.radius)
+        for i in (*self.units, *self.noise):
+            for j in range(self.size):
+                mid[i, j] = fmpq(int(i == j and i not in self.noise))
+                if radius is not None:
+                    radius[i, j] = fmpq(0)
+        for step in steps:
+            if step.seconds is None and self.decaying is not None:
+                mid[self.decaying, self.decaying] *= step.matrix.mid[self.decaying, self.decaying]
+        return Matrix(mid, radius)
+
+    def _require_time_to_pass(self) -> None:
+        """Require that each cycle of edges has an edge that lasts, or a location in which time may pass."""
+        left = {
+            name: {e.target for e in self.edges if e.source == name and e.duration == 0}
+            for name, location in self.locations.items()
+            if not location.motion
+        }
+        while ends := [name for name, targets in left.items() if not targets & {*left}]:
+            for name in ends:
+                del left[name]
+        if left:
+            raise RejectedError(f"edges: no time passes in a cycle through {min(left)}")
 
     def _read_start(self, value: object) -> None:
         """Read z(0) = Z (1, p): a column, and one for each noise coordinate p."""
         entry = mapping(value, "start")
         fields(entry, "start", {"location", "columns", "facts"})
-        (self.start,) = _known([entry["location"]], self.locations, "start")
-        self.start_facts = _known(entry["facts"], self.facts, "start")
+        (self.start,) = names_of([entry["location"]], self.locations, "start")
+        self.start_facts = names_of(entry["facts"], self.facts, "start")
         self.start_columns = Z = read_matrix(entry["columns"], self.size, 1 + len(self.noise))
         outside = [i for i in self.states if i not in self.locations[self.start].coordinates]
         if not Z.is_zero(outside, range(Z.width)):
@@ -344,11 +443,18 @@ class Document:
     def _output(self, entry: Table) -> Output:
         name = name_of(entry.get("name"), "outputs")
         place = f"output {name}"
-        fields(entry, place, {"name", "unit", "in"}, {"rows", "velocity", "input"})
-        where = _known(entry["in"], self.locations, place)
+        fields(entry, place, {"name", "unit", "in"}, {"rows", "velocity", "input", "during_edges"})
+        where = names_of(entry["in"], self.locations, place)
         if not where:
             raise RejectedError(f"{place}: it is in no location")
         unit = text_of(entry["unit"], place)
+        if ("input" in entry or "velocity" in entry) and not all(self.locations[n].motion for n in where):
+            raise RejectedError(f"{place}: a velocity or an input where no time passes")
+        if entry.get("during_edges", False) not in (False, True):
+            raise RejectedError(f"{place}: during_edges is true or false")
+        during = bool(entry.get("during_edges", False))
+        if during and ("input" in entry or "velocity" in entry):
+            raise RejectedError(f"{place}: a velocity or an input during edges")
         if "input" in entry:
             index = whole(entry["input"])
             inputs = min(self.locations[each].motion[0].input.height for each in where)
@@ -357,12 +463,15 @@ class Document:
             return Output(name, unit, None, None, index, where)
         rows = self._rows(entry.get("rows"), place)
         velocity = None if "velocity" not in entry else read_matrix(entry["velocity"], rows.height, self.size)
-        return Output(name, unit, rows, velocity, None, where)
+        return Output(name, unit, rows, velocity, None, where, during)
 
     def _limit(self, entry: Table) -> Limit:
         """Read a limit; its output is one of all locations, and is continuous but for edges."""
         fields(entry, "while", {"output", "less"})
-        (name,) = _known([entry["output"]], self.outputs, "while")
+        (name,) = names_of([entry["output"]], self.outputs, "while")
+        always_moves = all(location.motion for location in self.locations.values())
+        if any(edge.duration > 0 for edge in self.edges) or not always_moves:
+            raise RejectedError("while: a document with edges that last has no limits")
         less = rational(entry["less"])
         if less <= 0 or {*self.outputs[name].locations} != {*self.locations}:
             raise RejectedError(f"while {name}: not above 0, or the output is not one of all locations")
@@ -390,7 +499,7 @@ class Document:
         for entry in entries(value, f"reading {name}"):
             fields(entry, f"reading {name}", {"rows", "in"})
             self._rows(entry["rows"], f"reading {name}")
-            _known(entry["in"], self.locations, f"reading {name}")
+            names_of(entry["in"], self.locations, f"reading {name}")
 
 
 # Reading.
@@ -473,7 +582,7 @@ def name_of(value: object, place: str) -> str:
     return str(value)
 
 
-def _known(value: object, names: Iterable[str], place: str) -> tuple[str, ...]:
+def names_of(value: object, names: Iterable[str], place: str) -> tuple[str, ...]:
     """Return names, all of which are known, each once."""
     found, known = strings(value, place), {*names}
     if unknown := [each for each in found if each not in known]:

@@ -96,6 +96,8 @@ class ResetRows:
         Other edges leave Rz as it is there, and lead to nowhere else.
         """
         document, inside = self._document, {*self._output.locations}
+        if any(edge.duration > 0 for edge in document.edges):
+            raise RejectedError("times: an edge lasts")
         if apart <= 0:
             raise RejectedError("times: two events are not a time above 0 apart")
         live = [edge for edge in document.edges if edge.target is not None]
@@ -115,6 +117,8 @@ class ResetRows:
     def _verify_never(self, edge: Edge) -> None:
         """The source is entered by events only, which set its clock to 0."""
         document, source = self._document, self._document.locations[edge.source]
+        if any(other.duration > 0 for other in document.edges):
+            raise RejectedError("times: an edge lasts")
         entries = [other for other in document.edges if other.target == source.name]
         if source.name not in self._output.locations or edge.last is None:
             raise RejectedError(f"times: {edge.name}: no bound of the output, or of the clock")

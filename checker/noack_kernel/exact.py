@@ -13,6 +13,8 @@ ctx.prec = 128  # bits of a ball's midpoint
 
 MOST_DIGITS = 400
 """Most characters of a number, and largest exponent of a decimal."""
+_LARGEST = arb(10) ** 1000
+_LARGEST_EXPONENT = 2000
 _DECIMAL = re.compile(r"(-?)([0-9]+)(?:\.([0-9]+))?(?:[eE]([+-]?[0-9]+))?")
 _QUOTIENT = re.compile(r"(-?[0-9]+)/([0-9]+)")
 
@@ -177,12 +179,74 @@ def read_matrix(rows: object, height: int | None, width: int) -> Matrix:
     return Matrix(mid, radius)
 
 
+def symmetric(name: str, rows: object, size: int | None = None) -> Matrix:
+    """Return a symmetric and exact matrix of a file."""
+    height = (len(rows) if isinstance(rows, list) else 0) if size is None else size
+    M = read_matrix(rows, height, height)
+    if M.radius is not None or M.mid != M.mid.transpose():
+        raise RejectedError(f"matrix {name[:40]}: not symmetric and exact")
+    return M
+
+
 def padded(M: Matrix, more: int) -> Matrix:
     """Return a square matrix with further rows and columns of zeros."""
     if not more:
         return M
     z = unit_rows(range(M.height), M.height + more)
     return z.T @ M @ z
+
+
+def to_balls(M: Matrix) -> arb_mat:
+    """Return a matrix whose balls contain all matrices in M."""
+    found = arb_mat(M.mid)
+    if M.radius is not None:
+        for i in range(M.height):
+            for j in range(M.width):
+                found[i, j] += arb(0, arb(M.radius[i, j]).upper())
+    return found
+
+
+def from_balls(balls: arb_mat) -> Matrix:
+    """Return all matrices in balls.
+
+    Raises:
+        RejectedError: an entry is not finite, or beyond 10¹⁰⁰⁰.
+    """
+    if not all(abs(entry) < _LARGEST for entry in balls.entries()):
+        raise RejectedError("a product of matrices has an entry beyond 10^1000")
+    mid, radius = ([part(entry).fmpq() for entry in balls.entries()] for part in (arb.mid, arb.rad))
+    size = balls.nrows(), balls.ncols()
+    return Matrix(fmpq_mat(*size, mid), fmpq_mat(*size, radius) if any(r != 0 for r in radius) else None)
+
+
+def exponential(F: Matrix, seconds: arb) -> arb_mat:
+    """Return e^{Fs} in balls, for all matrices in F and all s in a ball; a row of zeros of F stays exact.
+
+    Raises:
+        RejectedError: F s is so large that the result has no meaning in balls.
+    """
+    Fs = to_balls(F) * seconds
+    sizes = (sum((abs(entry) for entry in row), arb(0)) for row in Fs.tolist())
+    if not all(size < _LARGEST_EXPONENT for size in sizes):
+        raise RejectedError(f"an exponent of e is beyond {_LARGEST_EXPONENT}")
+    found = Fs.exp()
+    for i in range(F.height):
+        if F.has_row(i, {}):
+            for j in range(F.width):
+                found[i, j] = arb(int(i == j))
+    return found
+
+
+def decay_below(rate: fmpq, seconds: fmpq) -> fmpq:
+    """Return an exact number d ≤ e^{−rs}, close to it."""
+    if rate * seconds > _LARGEST_EXPONENT:
+        return fmpq(0)
+    return arb(-rate * seconds).exp().lower().fmpq()
+
+
+def is_definite(M: Matrix) -> bool:
+    """Return whether all symmetric matrices in M are proven positive definite: no row is left out."""
+    return all(M.mid[i, i] != 0 for i in range(M.height)) and is_positive(M)
 
 
 def is_positive(M: Matrix) -> bool:

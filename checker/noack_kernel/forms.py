@@ -11,13 +11,16 @@ R6: forms V₁, V₂, … that have R3 may use each other. If V̇ᵢ ≤ −ν�
 mᵢⱼ ≥ 0, and Vᵢ⁺ ≤ Σ mᵢⱼ Vⱼ at edges, with mᵢⱼ ≥ 0, then all Vᵢ stay ≤ 0, since they are so at the start: such
 a system of inequalities is cooperative. So Σ m V of other forms may be added to what has to be ≥ 0. In an
 inequality that is affine in θ, such a number m is one number on each piece of the clock.
+
+A bound may be one of the runs that visit some of the locations only. Then the others, with the edges to and
+from them, are left out: the rest is a document, too.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Protocol
 
-from flint import fmpq
+from flint import arb, fmpq
 
 from noack_kernel.document import (
     MOST_NODES,
@@ -31,16 +34,18 @@ from noack_kernel.document import (
     fields,
     mapping,
     name_of,
+    names_of,
 )
 from noack_kernel.exact import (
     Matrix,
     RejectedError,
+    decay_below,
     is_positive,
     padded,
     product,
     rational,
-    read_matrix,
     square,
+    symmetric,
     unit_rows,
     whole,
     zeros,
@@ -69,7 +74,8 @@ class Forms:
 
     def __init__(self, document: Document, entry: Table) -> None:
         of_kind = {"name"} if "name" in entry else {"output", "from", "levels"}
-        fields(entry, "bound", of_kind | {"decay", "matrices", "forms", "multipliers"})
+        required = of_kind | {"decay", "matrices", "forms", "multipliers"}
+        fields(entry, "bound", required, {"only", "factors", "sub_step", "spread"})
         self._document = document
         self.output: Output | None = None
         self.starts, self.levels = True, (fmpq(0), fmpq(0))
@@ -77,22 +83,34 @@ class Forms:
             self.name = name_of(entry["name"], "lemma")
         else:
             self._read_bound(entry)
+        self.locations, self.edges = visited(document, entry.get("only"))
+        if self.starts and document.start not in self.locations:
+            raise RejectedError(f"{self.name}: no run starts in the locations that the bound is for")
         self.decay = rational(entry["decay"])
-        self._matrices = {
-            n: _symmetric(n, rows) for n, rows in mapping(entry["matrices"], "matrices").items()
-        }
+        self._matrices = {n: symmetric(n, rows) for n, rows in mapping(entry["matrices"], "matrices").items()}
         self._multipliers = mapping(entry["multipliers"], "multipliers")
+        self._factors = mapping(entry.get("factors", {}), "factors")
+        fields(self._factors, "factors", set(), {edge.name for edge in self.edges})
+        self._sub_step = rational(entry.get("sub_step", fmpq(1)))
+        self._spread = rational(entry.get("spread", fmpq(1)))
+        if not self._spread > 0:
+            raise RejectedError(f"{self.name}: the spread is not above 0")
         table = mapping(entry["forms"], "forms")
-        fields(table, "forms", {*document.locations})
+        fields(table, "forms", {*self.locations})
         self.nodes: dict[str, list[fmpq]] = {}
         self.P: dict[str, list[Matrix]] = {}
-        for location in document.locations.values():
+        for location in self.locations.values():
             self._read_form(location, mapping(table[location.name], "forms"))
         self._used: set[str] = set()
         self._others: Mapping[str, Forms] = {}
         self._rows: KnownFacts | None = None
         self.never: set[str] = set()
         """Edges with ``to: null`` that :meth:`verify` has proven to be never taken."""
+
+    @property
+    def is_of_all_runs(self) -> bool:
+        """Whether it is about runs that may visit all locations."""
+        return len(self.locations) == len(self._document.locations)
 
     def _read_bound(self, entry: Table) -> None:
         self.name = name_of(entry["output"], "output")
@@ -168,10 +186,12 @@ class Forms:
     def _inequalities(self) -> Iterator[tuple[str, Matrix]]:
         if not self.starts and not self.decay > 2 * self._document.rate:
             raise RejectedError(f"{self.name}: in the limit the decay is above twice the rate of the bound")
-        for location in self._document.locations.values():
+        for edge in self.edges:
+            self._require_factor(edge)
+        for location in self.locations.values():
             for corner in location.motion:
                 yield from self._of_motion(location, corner)
-        for edge in self._document.edges:
+        for edge in self.edges:
             if edge.target is not None:
                 yield from self._of_edge(edge)
             elif any(self._above(edge, node) for node in self.times(edge)):
@@ -179,8 +199,27 @@ class Forms:
         if self.starts:
             yield self._of_start()
         if self.output is not None:
-            for name in self.output.locations:
-                yield from self._of_output(self.output, self._document.locations[name])
+            yield from self._of_bound(self.output)
+
+    def _of_bound(self, output: Output) -> Iterator[tuple[str, Matrix]]:
+        """R4 in all locations of an output, and during edges."""
+        for name in output.locations:
+            if name in self.locations:
+                yield from self._of_output(output, self.locations[name])
+        for edge in self.edges:
+            if output.during_edges and edge.duration > 0:
+                yield from self._of_output_during(output, edge)
+
+    def _factor(self, edge: Edge) -> fmpq:
+        return rational(self._factors.get(edge.name, fmpq(1)))
+
+    def _require_factor(self, edge: Edge) -> None:
+        """Require λ ≥ 0 of an edge; in the limit also λ ≤ e^{−νT}, so that V ≤ C e^{−νt} over edges, too."""
+        factor = self._factor(edge)
+        if factor < 0:
+            raise RejectedError(f"{self.name}: the factor of {edge.name} is below 0")
+        if not self.starts and not arb(factor) <= arb(decay_below(self.decay, edge.duration)):
+            raise RejectedError(f"{self.name}: in the limit the factor of {edge.name} is at most e^(−νT)")
 
     def _of_motion(self, location: Location, corner: Corner) -> Iterator[tuple[str, Matrix]]:
         """R1: −(2 zᵀPż + zᵀP'z + ν zᵀPz) + Σ m q + Σ τ(|p|² − |Rz|²) ⪰ 0: then e^{νt} V does not increase."""
@@ -195,28 +234,28 @@ class Forms:
             decay = rational(table["decay"]) if "decay" in table else self.decay
             if not self.starts and decay != self.decay:
                 raise RejectedError(f"{place}: in the limit the decay is one number")
-            if self.name in mapping(table.get("forms", {}), place):
-                raise RejectedError(f"{place}: the form's own number is its decay")
             for end in (piece, piece + 1) if len(nodes) > 1 else (0,):
                 name = f"{place}/{end}"
                 P = forms[end]
                 M = product(P @ z, corner.velocity) + padded(slope + P.times(decay), signals)
-                M = M.times(fmpq(-1)) + padded(self._forms(table, location, end, fmpq(0)), signals)
+                M = M.times(fmpq(-1)) + padded(self._used_forms(table, location, end), signals)
                 M = self._with_facts(name, M, location.facts, location.name, z, corner)
                 yield name, self._within(location, M)
 
     def _of_edge(self, edge: Edge) -> Iterator[tuple[str, Matrix]]:
-        """R2: zᵀP_s z − (Jz)ᵀP_t(Jz) + Σ m q ⪰ 0: then V does not increase."""
+        """R2: λ zᵀP_s z − (Jz)ᵀP_t(Jz) + Σ m q ⪰ 0 with λ ≥ 0: then V ≤ 0 stays so.
+
+        λ is one number for each edge: λ P would be quadratic in the clock if both changed.
+        """
         facts, z = facts_at(self._document, edge), self._variables(0)
-        source = self._document.locations[edge.source]
+        source, factor = self._document.locations[edge.source], self._factor(edge)
         for node, other in self._pairs(edge):
             name = f"edge/{edge.name}/{node} {other}"
             after = edge.jump.T @ self.P[str(edge.target)][other] @ edge.jump
-            for before in self._before(f"edge/{edge.name}", source, self.times(edge), node):
-                yield (
-                    name,
-                    self._within(source, self._with_facts(name, before - after, facts, source.name, z, None)),
-                )
+            M = self.P[edge.source][node].times(factor) - after
+            for used in self._used_at(f"edge/{edge.name}", source, self.times(edge), node):
+                whole = self._with_facts(name, M + used, facts, source.name, z, None)
+                yield name, self._within(source, whole)
 
     def _of_dead_edge(self, edge: Edge) -> Iterator[tuple[str, Matrix]]:
         """R5: zᵀPz + Σ m q − ε (f1² or f2²) ⪰ 0 with ε > 0: where V ≤ 0 the edge is never taken."""
@@ -226,12 +265,10 @@ class Forms:
         source = self._document.locations[edge.source]
         for node in self.times(edge):
             name = f"edge/{edge.name}/{node}"
-            above = read_above(self._document, name, self._above(edge, node))
-            for before in self._before(f"edge/{edge.name}", source, self.times(edge), node):
-                yield (
-                    name,
-                    self._within(source, self._with_facts(name, before - above, facts, source.name, z, None)),
-                )
+            M = self.P[edge.source][node] - read_above(self._document, name, self._above(edge, node))
+            for used in self._used_at(f"edge/{edge.name}", source, self.times(edge), node):
+                whole = self._with_facts(name, M + used, facts, source.name, z, None)
+                yield name, self._within(source, whole)
         self.never.add(edge.name)
 
     def _above(self, edge: Edge, node: int) -> Table:
@@ -268,37 +305,52 @@ class Forms:
 
     def _of_output(self, output: Output, location: Location) -> Iterator[tuple[str, Matrix]]:
         """R4: D1² f1² + D2² f2² + zᵀPz + Σ m q + Σ τ(…) − |y|² ⪰ 0: then |y|² ≤ D1² f1² + D2² f2²."""
-        document = self._document
-        depends = output.rows is None or output.velocity is not None
-        for corner in location.motion if depends else location.motion[:1]:
+        document, corners = self._document, tuple[Corner | None, ...](location.motion)
+        if output.rows is not None and output.velocity is None:
+            corners = (None,)  # y does not depend on how z moves
+        for corner in corners:
             signals = corner if output.velocity is not None else None
-            z = self._variables(len(corner.unknown) if signals else 0)
-            if output.rows is None:
-                y = corner.input.take([output.input or 0], range(document.size)) @ z
-            else:
+            z = self._variables(0 if signals is None else len(signals.unknown))
+            y = zeros(0, z.width)
+            if output.rows is not None:
                 y = output.rows @ z
-            if output.velocity is not None:
+            elif corner is not None:
+                y = corner.input.take([output.input or 0], range(document.size)) @ z
+            if output.velocity is not None and corner is not None:
                 y += output.velocity @ corner.velocity
-            units = of_units(document, self.levels)
-            times = range(len(self.nodes[location.name]))
+            units, times = of_units(document, self.levels), range(len(self.nodes[location.name]))
             for node in times:
                 name = f"output/{location.name}/{node}"
-                for V in self._before(f"output/{location.name}", location, times, node):
-                    M = padded(V + units, z.width - z.height) - square(y)
-                    yield (
-                        name,
-                        self._within(
-                            location, self._with_facts(name, M, location.facts, location.name, z, signals)
-                        ),
-                    )
+                for used in self._used_at(f"output/{location.name}", location, times, node):
+                    V = padded(self.P[location.name][node] + used + units, z.width - z.height)
+                    M = self._with_facts(name, V - square(y), location.facts, location.name, z, signals)
+                    yield name, self._within(location, M)
+
+    def _of_output_during(self, output: Output, edge: Edge) -> Iterator[tuple[str, Matrix]]:
+        """R4 during an edge, with z, the form and the facts of its beginning; f1 has decayed by then.
+
+        See :mod:`.jumps`: |y|² ≤ (1 + a)|r z|² + (1 + 1/a) zᵀBz on a part of a flow. All parts of an edge use
+        the same multipliers, which are called during/EDGE.
+        """
+        document, a = self._document, self._spread
+        if output.rows is None:
+            return
+        name, facts, z = f"during/{edge.name}", facts_at(document, edge), self._variables(0)
+        for part in document.products.during(edge.steps, output.rows, self._sub_step):
+            decay = decay_below(document.rate, part.end)
+            levels = self.levels[0] * decay * decay, self.levels[1]
+            rest = of_units(document, levels) - part.beyond.times(1 + 1 / a)
+            for rows in part.ends:
+                y = square(rows).times(1 + a)
+                for node in self.times(edge):
+                    M = self.P[edge.source][node] + rest - y
+                    M = self._with_facts(name, M, facts, edge.source, z, None)
+                    yield name, self._within(document.locations[edge.source], M)
 
     # Parts of inequalities.
 
-    def _before(self, place: str, location: Location, times: range, node: int) -> Iterator[Matrix]:
-        """Yield the sum of forms at a node, for each piece of the clock at the node that has other numbers.
-
-        Without numbers it is the form itself.
-        """
+    def _used_at(self, place: str, location: Location, times: range, node: int) -> Iterator[Matrix]:
+        """Yield Σ m P of other forms at a node, for each piece of the clock there that has other numbers."""
         pieces = [times.start]
         if len(times) > 1:
             pieces = [piece for piece in (node - 1, node) if piece in range(times.start, times.stop - 1)]
@@ -307,16 +359,15 @@ class Forms:
             table = self._table(f"{place}/piece {piece}", {"forms"})
             if table not in tables:
                 tables.append(table)
-                yield self._forms(table, location, node, fmpq(1))
+                yield self._used_forms(table, location, node)
 
-    def _forms(self, table: Table, location: Location, node: int, own: fmpq) -> Matrix:
-        """Return Σ m P of forms at a node of a location; ``own``: the default number of the form itself."""
-        numbers = {self.name: own, **mapping(table.get("forms", {}), location.name)}
+    def _used_forms(self, table: Table, location: Location, node: int) -> Matrix:
+        """Return Σ m P of other forms at a node of a location."""
         total = zeros(self._document.size, self._document.size)
-        for name, value in numbers.items():
-            used = self if name == self.name else self._others.get(name)
-            if used is None:
-                raise RejectedError(f"{self.name}: no form {name[:40]!r} from the start on can be used")
+        for name, value in mapping(table.get("forms", {}), location.name).items():
+            used = self._others.get(name)
+            if used is None or used is self:
+                raise RejectedError(f"{self.name}: no other form {name[:40]!r} from the start on can be used")
             if used.nodes[location.name] != self.nodes[location.name]:
                 raise RejectedError(f"{self.name}: the form {name} has other nodes in {location.name}")
             total += used.P[location.name][node].times(multiplier(location.name, value))
@@ -353,11 +404,9 @@ class Forms:
             if signals:
                 raise RejectedError(f"{name}: multipliers of signals, of which there are none")
             return M
-        for index, signal in enumerate(corner.unknown):
-            p = unit_rows([self._document.size + index], M.width)
-            M += (square(p) - square(signal.rows @ z)).times(_next(name, signals))
-            if signal.along is not None:
-                along = square(p).times(2 * signal.least) - product(p, signal.along @ z)
+        for within, along in corner.squares:
+            M += within.times(_next(name, signals))
+            if along is not None:
                 M += along.times(_next(name, signals))
         if signals:
             raise RejectedError(f"{name}: more multipliers than signals")
@@ -369,12 +418,19 @@ class Forms:
         return M.take(kept, kept)
 
 
-def _symmetric(name: str, rows: object) -> Matrix:
-    height = len(rows) if isinstance(rows, list) else 0
-    M = read_matrix(rows, height, height)
-    if M.radius is not None or M.mid != M.mid.transpose():
-        raise RejectedError(f"matrix {name[:40]}: not symmetric and exact")
-    return M
+def visited(document: Document, only: object) -> tuple[dict[str, Location], list[Edge]]:
+    """Return the locations that a statement is about, with the edges between them; None: all.
+
+    Raises:
+        RejectedError: one is unknown, or there is none.
+    """
+    if only is None:
+        return document.locations, document.edges
+    names = names_of(only, document.locations, "only")
+    if not names:
+        raise RejectedError("only: no location")
+    edges = [e for e in document.edges if e.source in names and (e.target is None or e.target in names)]
+    return {name: document.locations[name] for name in names}, edges
 
 
 def read_levels(document: Document, name: str, value: object) -> tuple[fmpq, fmpq]:

@@ -170,7 +170,8 @@ class RowBound:
         place, source = f"edge/{edge.name}", self._document.locations[edge.source]
         table = self._numbers(place, {"facts", "form"})
         z = unit_rows(range(self._document.size), self._document.size)
-        M = of_units(self._document, within.enter) - square(self.rows @ edge.jump)
+        J = edge.jump  # f1 is smaller after an edge that lasts
+        M = J.T @ of_units(self._document, within.enter) @ J - square(self.rows @ J)
         M += bounds.of_facts(
             place, {"facts": table.get("facts", {})}, facts_at(self._document, edge), source.name, z
         )

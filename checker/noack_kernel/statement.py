@@ -1,4 +1,4 @@
-"""What a proof proves of a document: its bounds, one after the other, and rule R7 (limits of a region)."""
+"""What a proof proves of a document: bounds, times, growth, and rule R7 (limits of a region)."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 from flint import arb, fmpq
 
-from noack_kernel.document import Document, entries, fields, read_table
+from noack_kernel.document import Document, Table, entries, fields, read_table
 from noack_kernel.event_times import EventTimes, ResetRows
 from noack_kernel.exact import RejectedError
 from noack_kernel.forms import Forms
+from noack_kernel.growth import Growth
 from noack_kernel.row_bounds import RowBound, RowBounds
 
 FORMAT = "noack-forms 1"
@@ -37,6 +38,10 @@ class Statement:
     """Where the bound holds; None: in all locations."""
     inequalities: int
     """So many were verified."""
+    during_edges: bool = True
+    """Whether it holds while edges last, too. True if none lasts."""
+    only: tuple[str, ...] | None = None
+    """It holds for runs that visit only these locations; None: for all runs."""
 
     @property
     def decaying(self) -> Decimal:
@@ -63,9 +68,43 @@ class Statement:
         name = self.output if _PLAIN_NAME.fullmatch(self.output) else repr(self.output)
         unit = self.unit if _PLAIN_UNIT.fullmatch(self.unit) else repr(self.unit)
         unit = f" {unit}" if unit else ""
-        when = "at all times" if self.from_start else "in the limit t → ∞"
+        when = "at all times" if self.during_edges else "before and after each edge"
+        if not self.from_start:
+            when = "in the limit t → ∞" if self.during_edges else f"{when}, in the limit t → ∞"
         where = "" if self.locations is None else f", in the locations {', '.join(map(repr, self.locations))}"
-        return f"|{name}| ≤ {' + '.join(parts)}{unit} {when}{where}"
+        return f"|{name}| ≤ {' + '.join(parts)}{unit} {when}{where}{_visiting(self.only)}"
+
+
+@dataclass(frozen=True)
+class GrowthStatement:
+    """The difference of two runs grows at most, or at least, by a factor over a period, in the long run."""
+
+    factor: fmpq
+    period: fmpq
+    """In s."""
+    is_upper: bool
+    """No run grows faster; else ``cycle``, repeated, grows at least so fast, from some state on."""
+    cycle: tuple[str, ...]
+    """Edges."""
+    only: tuple[str, ...] | None
+    inequalities: int
+
+    def __str__(self) -> str:
+        rounding = ROUND_CEILING if self.is_upper else ROUND_FLOOR
+        by = f"the factor {_rounded(self.factor, rounding):f} per {_rounded(self.period, ROUND_CEILING):g} s"
+        if self.is_upper:
+            verdict = "stable" if self.factor < 1 else "not proven stable"
+            return (
+                f"the difference of two runs grows at most by {by} in the long run{_visiting(self.only)}: "
+                f"{verdict}"
+            )
+        verdict = "unstable" if self.factor > 1 else "not proven unstable"
+        edges = ", ".join(map(repr, self.cycle))
+        return f"the difference of two runs grows at least by {by}, if these edges repeat: {edges}: {verdict}"
+
+
+def _visiting(only: tuple[str, ...] | None) -> str:
+    return "" if only is None else f", for runs that visit only {', '.join(map(repr, only))}"
 
 
 @dataclass(frozen=True)
@@ -88,6 +127,7 @@ class Proven(NamedTuple):
     least_times: list[LeastTime]
     never: tuple[str, ...]
     """Edges with ``to: null``; all of them are proven to be never taken."""
+    growth: list[GrowthStatement]
     inequalities: int
     """So many were verified."""
 
@@ -95,7 +135,7 @@ class Proven(NamedTuple):
     def sentences(self) -> list[str]:
         """The statements, a sentence each."""
         edges = [f"the edge {name!r} is never taken" for name in self.never]
-        return [*map(str, self.bounds), *map(str, self.least_times), *edges]
+        return [*map(str, self.bounds), *map(str, self.least_times), *edges, *map(str, self.growth)]
 
 
 def prove(document: str, proof: str) -> Proven:
@@ -106,42 +146,68 @@ def prove(document: str, proof: str) -> Proven:
     """
     loop = Document(document)
     table = read_table(proof, FORMAT)
-    fields(table, "proof", {"format", "bounds"}, {"document", "lemmas", "rows", "times"})
+    fields(table, "proof", {"format", "bounds"}, {"document", "lemmas", "rows", "times", "growth"})
     if "document" in table and table["document"] != loop.digest:
         raise RejectedError("the proof is one of another document: it names another SHA-256")
-    lemmas = [Forms(loop, entry) for entry in entries(table.get("lemmas", []), "lemmas")]
-    bounds = [Forms(loop, entry) for entry in entries(table["bounds"], "bounds")]
-    if not bounds or any(forms.output is None for forms in bounds):
-        raise RejectedError("the proof has no bound, or a lemma among the bounds")
-    if any(forms.output is not None for forms in lemmas):
-        raise RejectedError("the proof has a bound among the lemmas")
-    if len({(forms.name, forms.starts) for forms in (*lemmas, *bounds)}) < len(lemmas) + len(bounds):
-        raise RejectedError("two bounds or lemmas of one name and kind")
-    usable = {forms.name: forms for forms in (*lemmas, *bounds) if forms.starts}
+    lemmas, bounds = _read_forms(loop, table)
+    usable = {forms.name: forms for forms in (*lemmas, *bounds) if forms.starts and forms.is_of_all_runs}
     rows = RowBounds(loop, [RowBound(loop, entry) for entry in entries(table.get("rows", []), "rows")])
     count = sum(forms.verify(usable, rows) for forms in lemmas)
     found = [_statement(loop, forms, usable, rows) for forms in bounds]
-    levels = {forms.name: forms.levels for forms in bounds if forms.starts}
+    levels = {name: forms.levels for name, forms in usable.items() if forms.output is not None}
     count += rows.verify(levels, usable)
     times = [ResetRows(loop, entry, levels).verify() for entry in entries(table.get("times", []), "times")]
-    never = _require_dead(loop, [*lemmas, *bounds], times)
+    growth = [_growth(loop, Growth(loop, entry)) for entry in entries(table.get("growth", []), "growth")]
+    if not found and not growth:
+        raise RejectedError("the proof has no bound")
+    never = _require_dead(loop, [forms for forms in (*lemmas, *bounds) if forms.is_of_all_runs], times)
     _require_limits(loop, found)
     least = [
         LeastTime(each.apart, tuple(name for name in loop.locations if name not in each.inside))
         for each in times
         if each.apart is not None
     ]
-    count += sum(each.inequalities for each in found) + sum(each.inequalities for each in times)
-    return Proven(found, least, never, count)
+    for statements in (found, growth, times):
+        count += sum(each.inequalities for each in statements)
+    return Proven(found, least, never, growth, count)
+
+
+def _read_forms(loop: Document, table: Table) -> tuple[list[Forms], list[Forms]]:
+    """Return lemmas and bounds; no two have the same name and kind."""
+    lemmas = [Forms(loop, entry) for entry in entries(table.get("lemmas", []), "lemmas")]
+    bounds = [Forms(loop, entry) for entry in entries(table["bounds"], "bounds")]
+    if any(forms.output is None for forms in bounds) or any(forms.output is not None for forms in lemmas):
+        raise RejectedError("a lemma is among the bounds, or a bound among the lemmas")
+    kinds = {(forms.name, forms.starts, tuple(forms.locations)) for forms in (*lemmas, *bounds)}
+    if len(kinds) < len(lemmas) + len(bounds):
+        raise RejectedError("two bounds or lemmas of one name and kind")
+    return lemmas, bounds
 
 
 def _statement(loop: Document, forms: Forms, usable: Mapping[str, Forms], rows: RowBounds) -> Statement:
-    output = forms.output
+    output, visited = forms.output, {*forms.locations}
     assert output is not None
-    everywhere = {*output.locations} == {*loop.locations}
-    locations = None if everywhere else output.locations
-    count = forms.verify(usable, rows)
-    return Statement(output.name, output.unit, forms.levels, loop.rate, forms.starts, locations, count)
+    where = tuple(name for name in output.locations if name in visited)
+    if not where:
+        raise RejectedError(f"{forms.name}: it is in none of the locations that the bound is for")
+    during = output.during_edges or not any(edge.duration > 0 for edge in forms.edges)
+    return Statement(
+        output.name,
+        output.unit,
+        forms.levels,
+        loop.rate,
+        forms.starts,
+        None if {*where} == visited else where,
+        forms.verify(usable, rows),
+        during,
+        None if visited == {*loop.locations} else tuple(forms.locations),
+    )
+
+
+def _growth(loop: Document, growth: Growth) -> GrowthStatement:
+    count = growth.verify()
+    only = None if {*growth.locations} == {*loop.locations} else tuple(growth.locations)
+    return GrowthStatement(growth.factor, growth.period, growth.is_upper, growth.cycle, only, count)
 
 
 def _require_dead(loop: Document, forms: Sequence[Forms], times: Sequence[EventTimes]) -> tuple[str, ...]:
@@ -165,7 +231,7 @@ def _require_limits(loop: Document, found: list[Statement]) -> None:
     it by R4, and a moment later, since y is continuous between edges. So no limit is ever reached.
     """
     for limit in loop.limits:
-        levels = [s.levels for s in found if s.output == limit.output and s.from_start]
+        levels = [s.levels for s in found if s.output == limit.output and s.from_start and s.only is None]
         if not any(sum(pair, fmpq(0)) < limit.less * limit.less for pair in levels):
             raise RejectedError(
                 f"while {limit.output}: no proven bound is below {float(arb(limit.less).mid()):g}"

@@ -160,18 +160,19 @@ class _QuietStart:
         return {
             "name": NAME,
             "decay": 0,
+            "factors": {edge["name"]: 0 for edge in self._document.table["edges"] if self._leaves(edge)},
             "matrices": matrices,
             "forms": forms | {name: {"nodes": nodes, "terms": terms}},
             "multipliers": dict(self._multipliers(answer)),
         }
 
+    def _leaves(self, edge: Table) -> bool:
+        """Return whether the first input acts at an edge: then nothing is left of the form."""
+        return bool(edge["from"] == self._edge["from"]) and edge["to"] is not None
+
     def _multipliers(self, answer: SolverAnswer) -> Iterator[tuple[str, Table]]:
         name, numbers = self._edge["from"], answer.numbers
         length = float(self._nodes[1])
-        for edge in self._document.table["edges"]:
-            if edge["from"] == name and edge["to"] is not None:
-                for piece in range(len(self._nodes) - 1):
-                    yield f"edge/{edge['name']}/piece {piece}", {"forms": {NAME: 0}}
         for node in range(len(self._nodes)):
             signals = [
                 value

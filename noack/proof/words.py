@@ -54,6 +54,10 @@ def _lines(document: Table) -> Iterator[str]:
         yield from _wrapped(f"- where {name} = ", [_row(row, names) for row in document["rows"][name]], "; ")
     for name, corners in document["motions"].items():
         yield from _motion(name, corners, document)
+    if document.get("steps"):
+        yield from ("", "## Steps of edges that last: M in z := M z, or F in z := e^(F s) z over s seconds")
+        for name, step in document["steps"].items():
+            yield from _step(name, step, document)
     yield from ("", "## Locations: how z moves, for how long, and what is 0")
     for location in document["locations"]:
         yield from _location(location, document)
@@ -132,7 +136,7 @@ def _location(location: Table, document: Table) -> Iterator[str]:
     units = {document.get("constant"), (document.get("decaying") or {}).get("coordinate")}
     every = [c["name"] for c in document["coordinates"] if c["name"] not in noise | units]
     missing = [name for name in every if name not in location["coordinates"]]
-    parts = [f"moves as {location['motion']!r}"]
+    parts = ["no time passes" if location["motion"] is None else f"moves as {location['motion']!r}"]
     if location.get("clock") is not None:
         parts.append(f"for at most {_time(location['clock'])}")
     if location["facts"]:
@@ -142,8 +146,9 @@ def _location(location: Table, document: Table) -> Iterator[str]:
 
 
 def _edge(edge: Table, names: Sequence[str], inside: Sequence[str]) -> Iterator[str]:
-    changes = []
-    for i, row in enumerate(edge.get("jump", [])):
+    changes, jump = [], edge.get("jump", [])
+    has_steps = any(not isinstance(each, list) for each in jump)
+    for i, row in enumerate([] if has_steps else jump):
         is_changed = [_value(v) for v in row] != [int(i == j) for j in range(len(names))]
         if is_changed and (names[i] in inside or any(map(_value, row))):
             changes.append(f"{names[i]} := {_row(row, names)}")
@@ -153,13 +158,35 @@ def _edge(edge: Table, names: Sequence[str], inside: Sequence[str]) -> Iterator[
         first, last = edge["when"]
         when = _time(last) if _value(first) == _value(last) else f"{_time(first)} to {_time(last)}"
         parts.append(f"when the clock shows {when}")
-    if edge["to"] is not None:
+    if edge["to"] is not None and not has_steps:
         parts.append(_CLOCKS[edge["clock"]])
     if edge["facts"]:
         parts.append(f"if {_quoted(edge['facts'])}")
-    if edge["to"] is not None:
+    if has_steps:
+        steps = [
+            repr(each) if isinstance(each, str) else f"{each['exp']!r} for {_time(each['seconds'])}"
+            for each in jump
+        ]
+        parts.append(f"lasts {_time(edge.get('duration', 0))}: {', '.join(steps)}")
+    elif edge["to"] is not None:
         parts.append(", ".join(changes) if changes else "nothing changes")
     yield from _wrapped(f"- {edge['name']!r}: ", parts, "; ")
+
+
+def _step(name: str, step: Table, document: Table) -> Iterator[str]:
+    """Yield what a step sets, or how z moves in it."""
+    names = [coordinate["name"] for coordinate in document["coordinates"]]
+    flows = {
+        each["exp"] for edge in document["edges"] for each in edge.get("jump", []) if isinstance(each, dict)
+    }
+    changes = []
+    for i, row in enumerate(step["matrix"]):
+        values = [_value(v) for v in row]
+        if name in flows and any(values):
+            changes.append(f"d/dt {names[i]} = {_row(row, names)}")
+        elif name not in flows and values != [int(i == j) for j in range(len(names))]:
+            changes.append(f"{names[i]} := {_row(row, names)}")
+    yield from _wrapped(f"- {name!r}: {step['words']}: ", changes or ["nothing changes"], ", ")
 
 
 def _start(start: Table, names: Sequence[str], noise: Sequence[str]) -> Iterator[str]:
@@ -181,6 +208,8 @@ def _output(output: Table, names: Sequence[str], locations: int) -> Iterator[str
         if "velocity" in output:
             velocity = "; ".join(_row(row, names) for row in output["velocity"])
             what = f"d/dt of ({velocity}) plus ({what})"
+    if output.get("during_edges"):
+        where += ", also while edges last"
     yield from _wrapped(f"- output {output['name']}{unit} = ", [f"{what}{where}"], " ")
 
 
