@@ -18,7 +18,6 @@ from pathlib import Path
 
 from noack_check.check import RejectedError
 from noack_check.files import UnreadableError, read_json, read_text, read_toml
-from noack_check.growth import prove_growth, read_periodic_loop
 from noack_check.keys import RefusedError, Table
 from noack_check.sentences import growth_sentences, quoted
 from noack_verify import verify
@@ -142,13 +141,7 @@ def check_file(file: Table, given: Table | None, equations: str | None = None) -
             raise RejectedError("a statement has no plants or conditions")
         if plants not in _PLANTS or conditions not in _CONDITIONS:
             raise RejectedError("a statement has no plants or conditions")
-        if document.get("statement") == "growth" and (plants, conditions) != ("own", "schedule"):
-            raise RejectedError("growth: is of the plant itself under its schedule")
         of = f"{quoted(name)}, {_PLANTS[plants]}, {_CONDITIONS[conditions]}"
-        if document.get("statement") == "growth":
-            growth = prove_growth(read_periodic_loop(scenario), document)
-            yield from (f"PROVED {of}, nothing late: {sentence}" for sentence in growth_sentences(growth))
-            continue
         raise RejectedError(
             "bounds have a document and a proof of their own: `noack certify NAME --document D --proof P`"
         )

@@ -8,30 +8,12 @@ from math import isfinite
 
 from flint import arb, fmpq
 
-from noack_check.growth import Growth
 from noack_check.proof import Bound, Proof
 
 _SHORT = 7
 """Longest decimal number that is printed as it is, if it stands for exactly that number."""
 
 
-def growth_sentences(growth: Growth) -> Iterator[str]:
-    """Yield what is proven of the growth of a time-triggered loop."""
-    per = f"per period of {float(arb(growth.period).mid()):.6g} s, in the long run"
-    if growth.upper is not None:
-        end = ": stable" if growth.upper < 1 else ""
-        ties = ", at whichever of two ticks each update acts," if growth.has_ties else ""
-        yield (
-            f"with at most {growth.losses} consecutive losses no pattern{ties} changes the loop's state by "
-            f"more than the factor {at_most(growth.upper)} {per}{end}"
-        )
-    if growth.lower is not None:
-        end = ": unstable" if growth.lower > 1 else ""
-        ties = " with each update at one of two ticks" if growth.has_ties else ""
-        yield (
-            f"with {growth.losses} consecutive losses allowed, {growth.pattern}, repeated{ties}, changes the "
-            f"loop's state at least by the factor {at_least(growth.lower)} {per}{end}"
-        )
 
 
 def quoted(name: str) -> str:

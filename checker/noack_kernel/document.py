@@ -28,14 +28,14 @@ from noack_kernel.exact import (
     whole,
     zeros,
 )
-from noack_kernel.jumps import Products, Step
+from noack_kernel.jumps import Products, Repeat, Step, Steps, duration_of, each_step
 
 FORMAT = "noack-hybrid 1"
 MOST_BYTES = 64 * 2**20
 MOST_COORDINATES, MOST_LOCATIONS, MOST_EDGES, MOST_NODES = 60, 200, 2000, 64
 MOST_SIGNALS = 200
-MOST_STEPS = 1000
-"""Of an edge."""
+MOST_STEPS = 100_000
+"""Of an edge, repeated ones included."""
 MOST_NAME = 200
 MOST_TEXT = 2000
 Table = Mapping[str, object]
@@ -110,7 +110,7 @@ class Edge:
     jump: Matrix
     event: bool
     """Whether it counts as an event: a statement about the time between two events is about such edges."""
-    steps: tuple[Step, ...]
+    steps: Steps
     """What happens during an edge, in order of time; ``jump`` is their product. Empty: it does not last."""
     duration: fmpq
     """How long the edge lasts, s."""
@@ -342,7 +342,7 @@ class Document:
             return Edge(name, source, None, first, last, clock, facts, nothing, event, (), fmpq(0))
         (target,) = names_of([entry["to"]], self.locations, place)
         steps = self._steps(place, entry.get("jump"))
-        duration = sum((step.seconds for step in steps if step.seconds is not None), fmpq(0))
+        duration = duration_of(steps)
         if rational(entry.get("duration", fmpq(0))) != duration:
             raise RejectedError(f"{place}: the duration is not that of its steps")
         J = self._product(steps) if steps else read_matrix(entry.get("jump"), self.size, self.size)
@@ -371,13 +371,25 @@ class Document:
         text_of(value["words"], f"step {name}")
         return read_matrix(value["matrix"], self.size, self.size)
 
-    def _steps(self, place: str, value: object) -> tuple[Step, ...]:
+    def _steps(self, place: str, value: object) -> Steps:
         """Return the steps of a jump; none if it is a matrix."""
         if not isinstance(value, list) or not any(isinstance(each, str | dict) for each in value):
             return ()
-        if len(value) > MOST_STEPS:
+        found = tuple(self._step_or_repeat(place, each) for each in value)
+        if (
+            sum(len(each.steps) * each.times if isinstance(each, Repeat) else 1 for each in found)
+            > MOST_STEPS
+        ):
             raise RejectedError(f"{place}: more than {MOST_STEPS} steps")
-        return tuple(self._step(place, each) for each in value)
+        return found
+
+    def _step_or_repeat(self, place: str, value: object) -> Step | Repeat:
+        if not isinstance(value, dict) or "repeat" not in value:
+            return self._step(place, value)
+        fields(value, place, {"repeat", "times"})
+        if not isinstance(value["repeat"], list) or (times := whole(value["times"])) < 1:
+            raise RejectedError(f"{place}: repeated are a list of steps, at least once")
+        return Repeat(tuple(self._step(place, each) for each in value["repeat"]), times)
 
     def _step(self, place: str, value: object) -> Step:
         """Return z := M z for the name of M, or z := e^{Fs} z. Noise and f2 keep their values meanwhile."""
@@ -396,7 +408,7 @@ class Document:
             raise RejectedError(f"{place}: a unit or noise changes in {name}")
         return Step(name, M, None)
 
-    def _product(self, steps: Sequence[Step]) -> Matrix:
+    def _product(self, steps: Steps) -> Matrix:
         """Return the product of steps; the rows of units are exact, and noise does not follow from a jump."""
         found = self.products.of(steps)
         mid, radius = fmpq_mat(found.mid), None if found.radius is None else fmpq_mat(found.radius)
@@ -405,7 +417,7 @@ class Document:
                 mid[i, j] = fmpq(int(i == j and i not in self.noise))
                 if radius is not None:
                     radius[i, j] = fmpq(0)
-        for step in steps:
+        for step in each_step(steps):
             if step.seconds is None and self.decaying is not None:
                 mid[self.decaying, self.decaying] *= step.matrix.mid[self.decaying, self.decaying]
         return Matrix(mid, radius)

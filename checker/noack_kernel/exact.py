@@ -13,8 +13,12 @@ ctx.prec = 128  # bits of a ball's midpoint
 
 MOST_DIGITS = 400
 """Most characters of a number, and largest exponent of a decimal."""
-_LARGEST = arb(10) ** 1000
-_LARGEST_EXPONENT = 2000
+_LARGEST, _SMALLEST = arb(10) ** 1000, arb(10) ** -1000
+_AROUND_0 = arb(0, _SMALLEST.upper())
+"""In place of smaller numbers, which would have millions of digits."""
+_LARGEST_EXPONENT = 10**15
+"""Of e, in which the numbers of a file may be in any unit."""
+_LARGEST_DECAY = 2000
 _DECIMAL = re.compile(r"(-?)([0-9]+)(?:\.([0-9]+))?(?:[eE]([+-]?[0-9]+))?")
 _QUOTIENT = re.compile(r"(-?[0-9]+)/([0-9]+)")
 
@@ -214,7 +218,8 @@ def from_balls(balls: arb_mat) -> Matrix:
     """
     if not all(abs(entry) < _LARGEST for entry in balls.entries()):
         raise RejectedError("a product of matrices has an entry beyond 10^1000")
-    mid, radius = ([part(entry).fmpq() for entry in balls.entries()] for part in (arb.mid, arb.rad))
+    kept = [entry if entry == 0 or not abs(entry) < _SMALLEST else _AROUND_0 for entry in balls.entries()]
+    mid, radius = ([part(entry).fmpq() for entry in kept] for part in (arb.mid, arb.rad))
     size = balls.nrows(), balls.ncols()
     return Matrix(fmpq_mat(*size, mid), fmpq_mat(*size, radius) if any(r != 0 for r in radius) else None)
 
@@ -223,7 +228,7 @@ def exponential(F: Matrix, seconds: arb) -> arb_mat:
     """Return e^{Fs} in balls, for all matrices in F and all s in a ball; a row of zeros of F stays exact.
 
     Raises:
-        RejectedError: F s is so large that the result has no meaning in balls.
+        RejectedError: the numbers in F s are so large that it takes long.
     """
     Fs = to_balls(F) * seconds
     sizes = (sum((abs(entry) for entry in row), arb(0)) for row in Fs.tolist())
@@ -239,7 +244,7 @@ def exponential(F: Matrix, seconds: arb) -> arb_mat:
 
 def decay_below(rate: fmpq, seconds: fmpq) -> fmpq:
     """Return an exact number d ≤ e^{−rs}, close to it."""
-    if rate * seconds > _LARGEST_EXPONENT:
+    if rate * seconds > _LARGEST_DECAY:
         return fmpq(0)
     return arb(-rate * seconds).exp().lower().fmpq()
 

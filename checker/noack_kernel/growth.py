@@ -3,15 +3,16 @@
 Here z has the coordinates without units and noise, which are 0: the difference of two runs that have the same
 loads moves so. J is the product of an edge's steps, and P the form of a location.
 
-* At most: P ≻ 0 in each location, and g^{2T/U} zᵀP_s z − (Jz)ᵀP_t(Jz) ⪰ 0 for each edge of the duration T.
-  Then zᵀPz grows at most by g² over the period U. Where an edge does not obey this, it suffices that all
-  paths that begin with it do so after some edges: each path is divided into such beginnings.
+* At most: P ≻ 0 in some locations, through which each cycle leads, and g^{2T/U} zᵀP_s z − (Jz)ᵀP_t(Jz) ⪰ 0
+  for each edge of the duration T. Then zᵀPz grows at most by g² over the period U. Where an edge does not
+  obey this, or leads to a location without a form, it suffices that all paths that begin with it do so after
+  some edges: each path is divided into such beginnings.
 * At least: a cycle of edges has the product Π over the time T, and s = g^{T/U}. If Π has a real eigenvalue
   above s, which the sign of det(s − Π) shows, or below −s, or if zᵀ(ΠᵀPΠ − s²P)z ⪰ 0 and vᵀPv > 0, so that
   vᵀPv grows by s² from round to round, then some z grows by at least g over the period U.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 from flint import arb, arb_mat, fmpq
@@ -31,7 +32,7 @@ from noack_kernel.exact import (
 )
 from noack_kernel.forms import visited
 
-MOST_PRODUCTS, LONGEST_PATH = 20_000, 24
+MOST_PRODUCTS, LONGEST_PATH = 20_000, 500
 """Of paths of several edges, and their edges."""
 LONGEST_CYCLE = 2000
 
@@ -79,8 +80,9 @@ class Growth:
     def _verify_forms(self) -> int:
         fields(self._entry, "growth", {"factor", "period", "forms"}, {"only"})
         table = mapping(self._entry["forms"], "forms")
-        fields(table, "forms", {*self.locations})
-        forms = {name: self._form(location, table[name]) for name, location in self.locations.items()}
+        fields(table, "forms", set(), {*self.locations})
+        forms = {name: self._form(self.locations[name], rows) for name, rows in table.items()}
+        self._require_forms(forms)
         leaving = {name: [edge for edge in self._edges if edge.source == name] for name in self.locations}
         count, products = len(forms), 0
         for name, P in forms.items():
@@ -88,9 +90,10 @@ class Growth:
             while paths:
                 edge, J, power, length = paths.pop()
                 count += 1
-                after = J.T @ forms[str(edge.target)] @ J
-                if self._is_above(name, P.times(power * power) - after):
-                    continue
+                if edge.target in forms:
+                    after = J.T @ forms[edge.target] @ J
+                    if self._is_above(name, P.times(power * power) - after):
+                        continue
                 following = leaving[str(edge.target)]
                 products += len(following)
                 if length == LONGEST_PATH or products > MOST_PRODUCTS:
@@ -101,6 +104,19 @@ class Growth:
                     further = from_balls(to_balls(self._state_map(each)) * to_balls(J))
                     paths.append((each, further, power * self._power(each.duration), length + 1))
         return count
+
+    def _require_forms(self, forms: Mapping[str, Matrix]) -> None:
+        """Require that each cycle of edges comes through a location that has a form."""
+        left = {
+            name: {edge.target for edge in self._edges if edge.source == name}
+            for name in self.locations
+            if name not in forms
+        }
+        while ends := [name for name, targets in left.items() if not targets & {*left}]:
+            for name in ends:
+                del left[name]
+        if left:
+            raise RejectedError(f"growth: no form in a cycle through {min(left)!r}")
 
     def _form(self, location: Location, rows: object) -> Matrix:
         """Return P of a location, on the coordinates of the homogeneous part that it has."""
@@ -138,7 +154,10 @@ class Growth:
             product, duration = to_balls(self._state_map(edge)) * product, duration + edge.duration
         if not duration > 0:
             raise RejectedError("growth: no time passes in the cycle")
-        least = self._power(duration)
+        # Coordinates that the location lacks are 0 before and after the cycle.
+        inside = [k for k, i in enumerate(self._homogeneous) if i in self._inside(path[0])]
+        size, kept = len(inside), from_balls(product).take(inside, inside)
+        product, least = to_balls(kept), self._power(duration)
         if "sign" in self._entry:
             if "form" in self._entry or "vector" in self._entry:
                 raise RejectedError("growth: a sign and a form")
@@ -154,6 +173,9 @@ class Growth:
                 f"growth: the cycle is not proven to grow by {float(arb(self.factor).mid()):g}"
             )
         return 1
+
+    def _inside(self, edge: Edge) -> tuple[int, ...]:
+        return self._document.locations[edge.source].coordinates
 
     def _require_cycle(self, path: Sequence[Edge]) -> None:
         """Require edges that follow each other, return to their beginning, may be taken, and be reached."""

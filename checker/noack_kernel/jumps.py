@@ -1,8 +1,8 @@
 """Edges that last: the product of their steps in balls, and what an output does during them.
 
-A step sets z := M z at once, or z := e^{Fs} z over s seconds. On a part of a flow from a to b, of length δ,
-y = C e^{F(θ−a)} z(a) is nearly linear: each entry of the row differs from the chord by at most
-w = δ²/8 · sup |C F² e^{F(θ−a)}|. So y(θ) = r z + e z with r on the chord and |eⱼ| ≤ wⱼ, and
+A step sets z := M z at once, or z := e^{Fs} z over s seconds; some steps may be repeated. On a part of a flow
+from a to b, of length δ, y = C e^{F(θ−a)} z(a) is nearly linear: each entry of the row differs from the chord
+by at most w = δ²/8 · sup |C F² e^{F(θ−a)}|. So y(θ) = r z + e z with r on the chord and |eⱼ| ≤ wⱼ, and
 
     |y|² ≤ (1 + a)|r z|² + (1 + 1/a)|e z|²,    |e z|² ≤ k Σ wⱼ² zⱼ²   (k of the wⱼ are not 0).
 
@@ -28,6 +28,37 @@ class Step(NamedTuple):
     seconds: fmpq | None
 
 
+class Repeat(NamedTuple):
+    """Steps, in order of time, which are taken so many times one after the other."""
+
+    steps: tuple[Step, ...]
+    times: int
+
+    @property
+    def seconds(self) -> fmpq:
+        """How long they last together, s."""
+        return duration_of(self.steps) * self.times
+
+
+Steps = Sequence[Step | Repeat]
+Key = tuple[object, ...]
+
+
+def duration_of(steps: Steps) -> fmpq:
+    """Return the sum of the steps' times, s."""
+    return sum((step.seconds for step in steps if step.seconds is not None), fmpq(0))
+
+
+def each_step(steps: Steps) -> Iterator[Step]:
+    """Yield all steps in order of time, the repeated ones again and again."""
+    for step in steps:
+        if isinstance(step, Repeat):
+            for _ in range(step.times):
+                yield from step.steps
+        else:
+            yield step
+
+
 class SubStep(NamedTuple):
     """|y|² ≤ (1 + a)|r z|² + (1 + 1/a) zᵀ ``beyond`` z for r between ``ends``, on a part of a flow."""
 
@@ -44,17 +75,23 @@ class Products:
     def __init__(self, size: int) -> None:
         self._size = size
         self._flows: dict[tuple[str, fmpq], arb_mat] = {}
-        self._products: dict[tuple[tuple[str, fmpq | None], ...], Matrix] = {}
+        self._products: dict[Key, Matrix] = {}
 
-    def of(self, steps: Sequence[Step]) -> Matrix:
+    def of(self, steps: Steps) -> Matrix:
         """Return the product of steps, which are in order of time."""
-        key = tuple((step.name, step.seconds) for step in steps)
+        key = _key(steps)
         if key not in self._products:
-            found = self._identity()
-            for step in steps:
-                found = self._map(step) * found
-            self._products[key] = from_balls(found)
+            self._products[key] = from_balls(self._product(steps))
         return self._products[key]
+
+    def _product(self, steps: Steps) -> arb_mat:
+        found = self._identity()
+        for step in steps:
+            if isinstance(step, Repeat):
+                found = self._product(step.steps) ** step.times * found
+            else:
+                found = self._map(step) * found
+        return found
 
     def _identity(self) -> arb_mat:
         return to_balls(unit_rows(range(self._size), self._size))
@@ -70,7 +107,7 @@ class Products:
             self._flows[key] = exponential(step.matrix, arb(seconds))
         return self._flows[key]
 
-    def during(self, steps: Sequence[Step], rows: Matrix, longest: fmpq) -> Iterator[SubStep]:
+    def during(self, steps: Steps, rows: Matrix, longest: fmpq) -> Iterator[SubStep]:
         """Yield an output on each part of each flow.
 
         Args:
@@ -84,7 +121,7 @@ class Products:
         if not longest > 0:
             raise RejectedError("a sub-step is not above 0")
         C, before, time, count = to_balls(rows), self._identity(), fmpq(0), 0
-        for step in steps:
+        for step in each_step(steps):
             if step.seconds is not None and step.seconds > 0:
                 parts = int((step.seconds / longest).ceil())
                 count += parts
@@ -102,6 +139,13 @@ class Products:
                     start = end
                 time += step.seconds
             before = self._map(step) * before
+
+
+def _key(steps: Steps) -> Key:
+    return tuple(
+        (_key(step.steps), step.times) if isinstance(step, Repeat) else (step.name, step.seconds)
+        for step in steps
+    )
 
 
 def _beyond(bend: Matrix) -> Matrix:

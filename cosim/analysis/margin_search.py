@@ -10,7 +10,7 @@ from itertools import combinations, permutations
 from typing import NamedTuple
 
 from cosim.analysis.certificates import CertificateAnswer, answer_for
-from cosim.analysis.growth_proof import GrowthProof, growth_proof
+from cosim.analysis.margin_proof import MarginProof, margin_proof
 from netem.tc_words import guarantee_words, settings_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -24,8 +24,7 @@ from noack.runtime.command_line import StopRequestError
 from noack.scenario.arrival_ties import late_inputs
 from noack.scenario.scenario import Scenario
 from noack.theory.random_losses.mean_square_growth import MeanSquareGrowth, growth_without_guarantee
-from noack.theory.witnesses.growth import ACCURACY
-from noack.theory.witnesses.loss_margin import LossMargin, Stability, capped, uncapped
+from noack.theory.witnesses.loss_margin import ACCURACY, LossMargin, Stability, capped, uncapped
 
 MOST_M = 16
 """Largest M that is examined by default."""
@@ -220,7 +219,7 @@ class MarginResult:
     """The growth under the scenario's losses if nothing limits them, or why it is not known."""
     certificate: CertificateAnswer | None = None
     """Whether the scenario has a certificate; None if this was not examined."""
-    proof: GrowthProof | None = None
+    proof: MarginProof | None = None
     """What noack-check has proven of the largest stable M and of the destabilising pattern."""
     effort: float = 1.0
     """Factor of the limits of the work for a decision."""
@@ -229,7 +228,7 @@ class MarginResult:
     ties: str = ""
     """Which order of an update and a tick is not known, in words."""
     late_inputs: str = ""
-    """That an input may miss a step of the plant, in words; this is not covered."""
+    """How late inputs may act in what is proven, in words."""
     missing: tuple[str, ...] = ()
     """What was not examined, in words, because the search was stopped."""
 
@@ -378,7 +377,7 @@ def find_margin(
     limit: PeriodLimit | None = None
     growth: MeanSquareGrowth | str = "not examined"
     certificate: CertificateAnswer | None = None
-    proof: GrowthProof | None = None
+    proof: MarginProof | None = None
     missing = [_CAPS, *([_OTHERS] if others_read else []), *([_PERIOD] if with_period else [])]
     missing += [_RANDOM, _CERTIFICATE]
     try:
@@ -398,7 +397,7 @@ def find_margin(
                 break
         missing.remove(_CAPS)
         progress("a proof for noack-check")
-        proof = growth_proof(resolved, [cap.stability for cap in caps])
+        proof = margin_proof(margin, [cap.stability for cap in caps], resolved.loop_outputs(), network.mansd)
         if others_read:
             compared = compare_guarantees([network.guarantee, *others_read], examine)
             missing.remove(_OTHERS)
@@ -432,7 +431,7 @@ def find_margin(
         effort=effort,
         compared=compared,
         ties=margin.ties,
-        late_inputs=late_inputs(resolved),
+        late_inputs=_of_late_inputs(resolved, margin),
         missing=tuple(f"M from {len(caps) + 1} on" if what == _CAPS else what for what in missing),
     )
 
@@ -449,6 +448,16 @@ def _with_implied_bounds(caps: Sequence[LossCap]) -> tuple[LossCap, ...]:
     for i in reversed(range(1, len(caps))):
         bounds[i - 1] = bounds[i - 1].with_upper_of(bounds[i])
     return tuple(cap._replace(stability=stability) for cap, stability in zip(caps, bounds, strict=True))
+
+
+def _of_late_inputs(resolved: Scenario, margin: LossMargin) -> str:
+    """Return how late inputs may act in what is proven."""
+    if margin.late:
+        return f"an input may act up to {margin.late} steps of the plant late, anew each time"
+    text = late_inputs(resolved)
+    if not text and resolved.certificate.late_periods:
+        text = "inputs are assumed to act on time: there are too many ticks in a period for other outcomes"
+    return text
 
 
 def _require_in_range(accuracy: float, effort: float) -> None:

@@ -3,7 +3,7 @@
 Nothing here has to be right: the kernel computes the maps again, in balls.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -14,6 +14,8 @@ from scipy.linalg import expm
 from noack.core.linear_systems import Matrix, Vector, balancing_exponents
 
 Table = Mapping[str, Any]
+_LARGEST = 1e150
+"""Entry of a map, so that its square is a double."""
 
 
 @dataclass(frozen=True)
@@ -77,15 +79,19 @@ class PeriodGraph:
         key = repr(steps)
         if key not in self._products:
             found = np.eye(self.size)
-            for step in steps:
-                found = self.step_map(step) @ found
+            with np.errstate(over="ignore", invalid="ignore"):
+                for step in steps:
+                    found = self.step_map(step) @ found
             self._products[key] = found
         return self._products[key]
 
     def step_map(self, step: Any) -> Matrix:
-        """Return the map of a step of an edge."""
+        """Return the map of a step of an edge, or of repeated steps."""
         if isinstance(step, str):
             return self._matrices[step]
+        if "repeat" in step:
+            with np.errstate(over="ignore", invalid="ignore"):
+                return np.linalg.matrix_power(self._product(step["repeat"]), step["times"])
         return self.flow(step["exp"], exact_value(step["seconds"]))
 
     def flow(self, name: str, seconds: Fraction) -> Matrix:
@@ -109,7 +115,7 @@ class PeriodGraph:
             longest: the longest part of a flow, s.
         """
         found, before = [], np.eye(self.size)
-        for step in edge.steps:
+        for step in each_step(edge.steps):
             if not isinstance(step, str) and (seconds := exact_value(step["seconds"])) > 0:
                 parts = -(-seconds // longest)
                 F, part = self._matrices[step["exp"]], float(seconds / parts)
@@ -126,9 +132,19 @@ class PeriodGraph:
         """Return sizes of the states in which the maps have similar rows and columns, (states,)."""
         sizes = sum(np.abs(edge.map[np.ix_(self.states, self.states)]) for edge in self.edges)
         sizes = np.asarray(sizes, float)
-        if not np.isfinite(sizes).all():
+        if not (np.isfinite(sizes).all() and sizes.max(initial=0.0) < _LARGEST):
             raise OverflowError
         return np.ldexp(1.0, -balancing_exponents(sizes))
+
+
+def each_step(steps: Sequence[Any]) -> Iterator[Any]:
+    """Yield the steps of an edge in order of time, the repeated ones again and again."""
+    for step in steps:
+        if isinstance(step, str) or "repeat" not in step:
+            yield step
+        else:
+            for _ in range(step["times"]):
+                yield from step["repeat"]
 
 
 def exact_value(value: Any) -> Fraction:

@@ -163,21 +163,30 @@ def _edge(edge: Table, names: Sequence[str], inside: Sequence[str]) -> Iterator[
     if edge["facts"]:
         parts.append(f"if {_quoted(edge['facts'])}")
     if has_steps:
-        steps = [
-            repr(each) if isinstance(each, str) else f"{each['exp']!r} for {_time(each['seconds'])}"
-            for each in jump
-        ]
-        parts.append(f"lasts {_time(edge.get('duration', 0))}: {', '.join(steps)}")
+        parts.append(f"lasts {_time(edge.get('duration', 0))}: {', '.join(map(_taken, jump))}")
     elif edge["to"] is not None:
         parts.append(", ".join(changes) if changes else "nothing changes")
     yield from _wrapped(f"- {edge['name']!r}: ", parts, "; ")
+
+
+def _taken(step: Any) -> str:
+    """Return a step of an edge."""
+    if isinstance(step, str):
+        return repr(step)
+    if "repeat" in step:
+        return f"{step['times']} times ({', '.join(map(_taken, step['repeat']))})"
+    return f"{step['exp']!r} for {_time(step['seconds'])}"
 
 
 def _step(name: str, step: Table, document: Table) -> Iterator[str]:
     """Yield what a step sets, or how z moves in it."""
     names = [coordinate["name"] for coordinate in document["coordinates"]]
     flows = {
-        each["exp"] for edge in document["edges"] for each in edge.get("jump", []) if isinstance(each, dict)
+        each["exp"]
+        for edge in document["edges"]
+        for one in edge.get("jump", [])
+        for each in (one.get("repeat", [one]) if isinstance(one, dict) else ())
+        if isinstance(each, dict)
     }
     changes = []
     for i, row in enumerate(step["matrix"]):

@@ -52,7 +52,7 @@ def growing(losses: int) -> tuple[Table, Table]:
     search = GrowthSearch(PeriodGraph(document))
     cycle = search.cycle
     assert cycle is not None
-    least = search.at_least(cycle)
+    least = search.at_least(cycle, 1e-6)
     most = next(filter(None, (search.at_most(cycle.growth * (1 + gap)) for gap in (0.0042, 0.016))))
     assert least is not None
     return document, proof_of(growth=[least, most])
@@ -128,15 +128,15 @@ def test_eleven_losses_in_a_row_are_stable_and_twelve_are_not() -> None:
 def test_a_smaller_part_of_a_document_has_statements_of_its_own() -> None:
     document, kept = drive(3), ["0 lost", "1 lost"]
     search = GrowthSearch(PeriodGraph(document, kept))
-    entry = search.at_most(0.9)
+    entry = search.at_most(0.88)
     assert entry is not None
     _, (growth,) = proven(document, proof_of(growth=[entry]))
     assert str(growth) == (
-        "the difference of two runs grows at most by the factor 0.9 per 0.01 s in the long run, for "
+        "the difference of two runs grows at most by the factor 0.88 per 0.01 s in the long run, for "
         "runs that visit only '0 lost', '1 lost': stable"
     )
-    with pytest.raises(RejectedError, match="missing"):
-        proven(document, proof_of(growth=[entry | {"only": [*kept, "2 lost"]}]))
+    with pytest.raises(RejectedError, match="not proven of paths"):
+        proven(document, proof_of(growth=[entry | {"only": [*kept, "2 lost", "3 lost"]}]))
     with pytest.raises(RejectedError, match="unknown name"):
         proven(document, proof_of(growth=[entry | {"only": [*kept, "4 lost"]}]))
 
@@ -434,7 +434,7 @@ FAULTS_OF_GROWTH: dict[Change, str] = {
     take_no_period: "not above 0",
     have_an_empty_form: "not positive definite",
     have_a_negative_form: "not positive definite",
-    have_no_form: "missing",
+    have_no_form: "no form in a cycle",
     have_forms_and_a_cycle: "either forms or a cycle",
     skip_an_edge: "does not follow",
     stop_early: "does not follow",
@@ -462,7 +462,7 @@ def test_a_complex_pair_is_shown_by_a_form() -> None:
     document = turning([[c, -s], [s, c]])
     search = GrowthSearch(PeriodGraph(document))
     assert search.cycle is not None
-    entry = search.at_least(search.cycle)
+    entry = search.at_least(search.cycle, 1e-6)
     assert entry is not None
     assert "form" in entry
     _, (growth,) = proven(document, proof_of(growth=[entry]))

@@ -1,7 +1,6 @@
 """The growth of time-triggered loops: what noack-check accepts is true, and false witnesses are rejected."""
 
 import copy
-import json
 from collections.abc import Mapping, Sequence
 from itertools import product
 from math import lcm
@@ -13,15 +12,16 @@ import pytest
 
 from cosim.analysis.witnesses import resolved_content
 from noack.core.linear_systems import Matrix
+from noack.proof.period_times import LoopTimes
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.time_triggered.time_triggered_loop import LoopTimes, TimeTriggeredLoop
+from noack.theory.time_triggered.time_triggered_loop import TimeTriggeredLoop
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.growth import enclose_growth
-from noack_check.__main__ import check_file
 from noack_check.check import RejectedError
 from noack_check.growth import PeriodicLoop, prove_growth, read_periodic_loop
 from noack_check.keys import RefusedError
+from noack_kernel.__main__ import verify
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import shipped
 
@@ -379,15 +379,15 @@ def test_an_observer_that_learns_nothing_is_not_called_stable() -> None:
         read_periodic_loop(content)
 
 
-def test_the_command_writes_what_noack_check_proves(tmp_path: Path) -> None:
-    path = tmp_path / "growth.json"
+def test_the_command_writes_what_noack_check_proves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / name for name in ("document.json", "proof.json")]
     words = ("unstable_pendulum", "--set", PERIODIC, "--set", "mode=zoh", "--no-period")
-    result = invoke("margin", *words, "--witness", str(path))
+    result = invoke("margin", *words, "--document", str(files[0]), "--proof", str(files[1]))
     assert result.stdout.count("proved by noack-check: with") == 2
-    lines = list(check_file(json.loads(path.read_text()), None))
-    start = 'PROVED "unstable_pendulum", its plant, its schedule, nothing late: '
-    assert [line.startswith(start) for line in lines] == [True, True]
-    file = json.loads(path.read_text())
-    file["statements"][0]["plants"] = "box"
-    with pytest.raises(RejectedError, match="growth: is of the plant itself"):
-        list(check_file(file, None))
+    assert verify(*files) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("PROVED")]
+    assert len(lines) == 2
+    assert lines[0].endswith(": stable")
+    assert lines[1].endswith(": unstable")

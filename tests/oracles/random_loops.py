@@ -1,9 +1,8 @@
-"""Random time-triggered loops whose growth under losses is at a chosen distance from 1."""
+"""Random time-triggered loops under losses."""
 
 from typing import NamedTuple
 
 import numpy as np
-from flint import arb, arb_mat
 from scipy.linalg import block_diag, solve_continuous_are
 
 from cosim.analysis.margin_search import read_guarantee
@@ -15,21 +14,19 @@ from noack.scenario.scenario_file import load, validate
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.loss_margin import LossMargin, checked_guarantee
-from noack_check.growth import Burst, PeriodicLoop
+from noack_check.growth import PeriodicLoop
 
 GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
 
 
 class RandomLoop(NamedTuple):
-    """A loop whose growth has been scaled to a chosen distance from 1."""
+    """A loop with a guarantee."""
 
     margin: LossMargin
     guarantee: LossGuarantee
     kind: str
     growth: float
-    """The growth of the worst pattern that a search of its own found, after scaling."""
-    scale: float
-    """s."""
+    """The growth of the worst pattern that a search of its own found."""
 
 
 def _matrices(rng: np.random.Generator, largest: int) -> tuple[Matrix, Matrix, Matrix]:
@@ -42,9 +39,7 @@ def _matrices(rng: np.random.Generator, largest: int) -> tuple[Matrix, Matrix, M
 def random_loop(seed: int) -> RandomLoop:
     """Return the loop with a number: linear-quadratic regulators of random plants.
 
-    One of six consists of two loops that do not influence each other. The maps between deliveries
-    are multiplied by s^duration, so that the worst pattern's growth is 10^-3 to 0.1
-    above 1, or below for three of four.
+    One of six consists of two loops that do not influence each other.
     """
     rng = np.random.default_rng([seed, 43])
     # The plant, its regulator, and how it is sampled.
@@ -76,29 +71,8 @@ def random_loop(seed: int) -> RandomLoop:
     if number >= 2:
         words += f" recover {rng.integers(2, 4)}"
     guarantee = read_guarantee(words)
-    # The growth of the worst pattern, scaled to a distance from 1.
-    distance = 10 ** rng.uniform(-3, -1)
-    wanted = 1 + distance if rng.random() < 0.25 else 1 - distance
-    scale = wanted / _fastest(margin.loop.under(checked_guarantee(guarantee)))
-    margin.loop = ScaledLoop.of(margin.loop, scale)
-    return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[number]}", wanted, scale)
-
-
-class ScaledLoop(PeriodicLoop):
-    """A loop whose states are multiplied by a factor, too, with each unit of time."""
-
-    scale: float
-
-    @classmethod
-    def of(cls, loop: PeriodicLoop, scale: float) -> "ScaledLoop":
-        """Return a loop with a factor."""
-        scaled = cls(loop.matrices, loop.times, loop.between, loop.guarantee)
-        scaled.scale = scale
-        return scaled
-
-    def matrix(self, burst: Burst) -> arb_mat:
-        """Return the matrix of a burst."""
-        return arb(self.scale) ** burst.units * super().matrix(burst)
+    growth = _fastest(margin.bursts_loop.under(checked_guarantee(guarantee)))
+    return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[number]}", growth)
 
 
 def _fastest(loop: PeriodicLoop) -> float:

@@ -303,7 +303,7 @@ def margin(
     most: Annotated[int, Option(help="Largest M to examine, 1 to 1000.")] = 16,
     accuracy: Annotated[
         float, Option(help="Wanted ratio of the bounds, minus 1; finer where they include 1.")
-    ] = 2e-4,
+    ] = 4e-3,
     period: Annotated[
         bool, Option(help="Search for the longest period with the scenario's own M, too.")
     ] = True,
@@ -316,9 +316,16 @@ def margin(
     ] = None,
     effort: Annotated[float, Option(help="Factor of the work that a decision may take.")] = 1.0,
     play: Annotated[bool, Option("--play", help="Play the destabilising pattern in a live run.")] = False,
-    witness: Annotated[
+    document: Annotated[
         Path | None,
-        Option(callback=opt.usable_path, help="Write what the program noack-check verifies (.json)."),
+        Option(
+            callback=opt.usable_path,
+            help="Write the loop document that the proofs are about to this file (.json), for noack-check.",
+        ),
+    ] = None,
+    proof: Annotated[
+        Path | None,
+        Option(callback=opt.usable_path, help="Write the proof to this file (.json), for noack-check."),
     ] = None,
     runs: opt.RunsOption = DEFAULT_RUNS,
     tables: opt.TablesOption = None,
@@ -333,15 +340,16 @@ def margin(
     --play takes the scenario's horizon, or a longer one, up to 10 minutes, at which the growth of
     ‖x‖ shows, and prints what to expect.
 
-    Takes a second of CPU time for each M. It takes up to 40 s for an M if an update may act at either of two
-    ticks (90 s for 14 values of M), and minutes if the times of events vary, as with a deadline. The search
-    for the longest period adds some seconds. Each result is printed when it is known.
+    Takes a second of CPU time for each M, and minutes if the times of events vary, as with a deadline. The
+    search for the longest period adds some seconds. Each result is printed when it is known.
     """
     from cosim.analysis.margin_search import find_margin
     from cosim.output.certificate_report import margin_document
     from cosim.record.run_directory import write_output
     from noack.scenario.resolution import resolve
 
+    if (document is None) != (proof is None):
+        raise CallerError("--document and --proof: noack-check needs both files; add the other option")
     if play and json:
         raise CallerError("--play: has an output of its own; leave out --json")
     if play:
@@ -360,8 +368,12 @@ def margin(
             decided=lambda cap: print_to_stderr(f"noack: {cap.text}"),
         )
     show(margin_document(result), json=json, tables=tables)
-    if witness is not None and result.proof is not None and result.proof.documents:
-        write_output(witness, result.proof.file_text())
+    if document is not None and proof is not None and result.proof is not None:
+        write_output(document, result.proof.document)
+        write_output(proof, result.proof.proof)
+        print_to_stderr(f"noack: wrote {document} and {proof}; noack-check {document} {proof} verifies them")
+    elif document is not None:
+        raise CallerError("--document: nothing was proven of this loop by a document")
     if stops:  # the results so far are shown
         print_to_stderr(f"noack: {stops[0]}; missing: {', '.join(result.missing)}")
         return stops[0].exit_status

@@ -116,7 +116,7 @@ class NetworkSearch:
         self.request, self.scenario = request, time_triggered(scenario, request.period_s)
         resolved = resolve(self.scenario)
         self.plant, margin = loop_of(resolved), LossMargin(resolved)
-        self.measurements, self._loop = margin.longest, margin.loop
+        self.measurements, self._loop = margin.longest, margin.bursts_loop
         """From an update to the next one."""
         self._times = loop_times(resolved, margin.longest)
         self._latest = [max(self._loop.times.arrivals(slot)) for slot in range(self._times.slots)]

@@ -37,6 +37,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Stack, Vector, balancing_exponents, exponential
 from noack.impairments.loss_prediction import OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
+from noack.proof.period_times import LoopTimes
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.coverage import nonlinear_because
@@ -50,7 +51,7 @@ from noack.theory.random_losses.mean_square_growth import (
 )
 from noack.theory.time_triggered.exact_matrices import exactly
 from noack.theory.time_triggered.scenario_times import intervals, loop_times, require_idle_watchdog
-from noack.theory.time_triggered.time_triggered_loop import LoopTimes, Timeline, repeated
+from noack.theory.time_triggered.time_triggered_loop import Timeline, repeated
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 """Of Gauss's formula on [−1, 1]."""

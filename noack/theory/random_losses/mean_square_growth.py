@@ -25,13 +25,14 @@ from noack.core.linear_systems import Matrix, Stack, Vector, balancing_exponents
 from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
+from noack.proof.period_times import NEVER, LoopTimes
 from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.time_triggered.exact_matrices import IntervalMatrix, exactly, inverse
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.time_triggered.scenario_times import intervals, loop_times
-from noack.theory.time_triggered.time_triggered_loop import NEVER, LoopTimes, TimeTriggeredLoop
+from noack.theory.time_triggered.time_triggered_loop import TimeTriggeredLoop
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array  # slow to import

@@ -7,16 +7,14 @@ delay, and a watchdog that does not act.
 import math
 from fractions import Fraction
 
-import numpy as np
-
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
+from noack.proof.period_times import NEVER, LoopTimes
 from noack.scenario.arrival_ties import WITHOUT_DELAY
-from noack.scenario.resolution import rule_of, setpoint_of
+from noack.scenario.resolution import rule_of
 from noack.scenario.scenario import Scenario
 from noack.theory.coverage import require_exact
-from noack.theory.time_triggered.time_triggered_loop import NEVER, LoopTimes
 
 _MOST_ON_THEIR_WAY = 40
 """Most updates on their way at once, times the number of states: the size of what is followed."""
@@ -28,15 +26,6 @@ def require_covered(resolved: Scenario) -> None:
     require_exact(without_timeout(resolved))
     resolved.coverage.require_constant()
     require_idle_watchdog(resolved)
-    if resolved.controller.update_timeout_s is None or resolved.controller.timeout_input == "hold":
-        return
-    setpoint, m = setpoint_of(resolved), resolved.model.dimensions[1]
-    at_rest = np.zeros(m) if setpoint is None else setpoint[1]
-    if not np.allclose(resolved.controller.safe_input or np.zeros(m), at_rest, rtol=1e-9, atol=0):
-        raise CallerError(
-            "controller.safe_input: with update_timeout_s the margin needs the input at rest, "
-            f"{[float(f'{u:.10g}') for u in at_rest]}"
-        )
 
 
 def without_timeout(scenario: Scenario) -> Scenario:
@@ -120,7 +109,12 @@ def _require_few_on_their_way(resolved: Scenario, delay_s: float, period_s: floa
             f"network.impairments: a delay of {delay_s:g} s is {behind} periods of {period_s:g} s; "
             f"a loop of this size is followed for at most {most}"
         )
-    if behind and resolved.controller.update_timeout_s is not None:
+
+
+def require_usable_updates(resolved: Scenario, times: LoopTimes) -> None:
+    """Raise CallerError if updates expire that may be on their way for a period."""
+    if times.behind and resolved.controller.update_timeout_s is not None:
+        delay_s, period_s = times.seconds(times.whole_delay), times.seconds(times.period)
         raise CallerError(
             f"controller.update_timeout_s: not covered with a delay of {delay_s:g} s, which is longer than "
             f"the {period_s:g} s between two updates"

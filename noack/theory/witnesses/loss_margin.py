@@ -1,13 +1,16 @@
 """The losses that a loop tolerates whatever its sensor measures: stable for all patterns, or not.
 
-The sensor is time-triggered, or transmits at unknown times with a longest time between two. What
-may happen between two deliveries under a guarantee is a graph of bursts; a pattern of losses, and of such
-times, is a path (:mod:`noack_check.growth`). :mod:`noack.theory.witnesses.growth` searches for witnesses
-of its growth, and every bound is one that noack-check has accepted.
+The sensor is time-triggered, or transmits at unknown times with a longest time between two. A document
+without motions says what may happen from one transmission to the next (:mod:`noack.proof.period_document`),
+and every bound of the growth is one that the kernel has proven. Loops that transmit at unknown times while
+updates are on their way, or expire, have no such document: there the older verifier proves the growth
+(:mod:`noack_check.growth`, :mod:`noack.theory.witnesses.growth`).
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
+from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -19,12 +22,19 @@ from noack.guarantee.loss_guarantee import (
     LossGuarantee,
     outcome_letters,
 )
+from noack.proof.loop_document import NoDocumentError
+from noack.scenario.arrival_ties import LATENCY_NS
 from noack.scenario.scenario import Scenario
-from noack.theory.time_triggered.scenario_times import intervals, loop_times, require_covered
-from noack.theory.witnesses.growth import ACCURACY, Document, GrowthBounds, enclose_growth, intervals_of
-from noack_check.growth import LATENCY_NS, Guarantee, PeriodicLoop, read_periodic_loop
+from noack.theory.time_triggered.scenario_times import intervals, require_covered, require_usable_updates
+from noack.theory.witnesses.growth import GrowthBounds, enclose_growth, intervals_of
+from noack.theory.witnesses.period_loops import Entry, period_loop, prove_growth
+from noack_check.growth import Guarantee, PeriodicLoop, read_periodic_loop
 from noack_check.keys import RefusedError
 
+ACCURACY = 4e-3
+"""Wanted upper/lower − 1 over the longest time between two transmissions."""
+_MOST_STEPS, _MOST_SLOTS = 20_000, 64
+"""Steps and ticks, and transmissions, after which the times of a loop repeat."""
 _COARSE_ACCURACY, _QUICK_ACCURACY = 1e-2, 3e-2
 """Wanted upper/lower − 1 of :meth:`LossMargin.coarse_bounds` and :meth:`LossMargin.first_bounds`."""
 
@@ -41,8 +51,8 @@ class Stability(NamedTuple):
     it begins with a delivery."""
     intervals_s: tuple[float, ...]
     """The time from each update of the pattern to the next one."""
-    documents: Mapping[str, Document] = MappingProxyType({})
-    """The witnesses that noack-check has accepted, of the bounds "stable" and "unstable"."""
+    entries: Mapping[str, Entry] = MappingProxyType({})
+    """The entries of a proof of both bounds, "most" and "least"; none for the older verifier."""
 
     @property
     def verdict(self) -> str:
@@ -64,7 +74,7 @@ class Stability(NamedTuple):
     def to_json(self) -> dict[str, object]:
         """Return what is known, for JSON."""
         known = self._asdict() | {"pattern": self.text, "verdict": self.verdict}
-        del known["documents"]
+        del known["entries"]
         return known
 
     @property
@@ -128,17 +138,33 @@ class LossMargin:
             is_regular = self.shortest == self.longest
             self.shortest = longest if is_regular else min(self.shortest, longest)
             self.longest = longest
+        self._resolved = resolved
         self._unit = self.longest if self.shortest == self.longest else 1
         self._measurement = resolved.timing.measurement_period
-        loop_times(resolved, self._unit)  # refuses what is not covered, naming the setting
-        try:
-            self.loop = read_periodic_loop(resolved.content(), longest)
-        except RefusedError as error:
-            raise CallerError(str(error)) from None
+        self.between = range(self.shortest // self._unit, self.longest // self._unit + 1)
+        """Units between two transmissions: the period, or measurements."""
+        self.period_loop = period_loop(resolved, self.between, self._unit)
+        times = self.period_loop.times
+        if times.slots > _MOST_SLOTS or math.lcm(times.step, times.tick) // min(times[:2]) > _MOST_STEPS:
+            raise CallerError("the times of the loop repeat only after too many steps")
         # A controller that knows x(0) gets its first update after a period.
         knows_start = resolved.network.initial_sync == "known_state"
         # Where updates are on their way for several periods, the first one arrives so much later.
-        self._first_slot = (int(knows_start) + self.loop.times.behind) % self.loop.times.slots
+        self._first_slot = (int(knows_start) + times.behind) % times.slots
+
+    @cached_property
+    def bursts_loop(self) -> PeriodicLoop:
+        """The loop as the older verifier has it.
+
+        Raises:
+            CallerError: the loop is not covered.
+        """
+        times, longest = self.period_loop.times, self.longest
+        require_usable_updates(self._resolved, times)
+        try:
+            return read_periodic_loop(self._resolved.content(), longest)
+        except RefusedError as error:
+            raise CallerError(str(error)) from None
 
     def seconds(self, measurements: int) -> float:
         """Return the time of a number of measurements."""
@@ -147,7 +173,8 @@ class LossMargin:
     @property
     def ties(self) -> str:
         """Which order of an update and a tick is not known, as a sentence; empty: there is none."""
-        if not self.loop.times.has_ties:
+        times = self.period_loop.times
+        if all(len(times.arrivals(slot)) == 1 for slot in range(times.slots)):
             return ""
         return (
             f"an update arrives within {LATENCY_NS / 1e6:g} ms of a tick of the controller: it may act at "
@@ -155,10 +182,15 @@ class LossMargin:
         )
 
     @property
+    def late(self) -> int:
+        """Most steps of the plant by which an input may be late in what is proven."""
+        return self.period_loop.covered_late
+
+    @property
     def delay_ns(self) -> Fraction:
         """The delay of an update."""
-        times = self.loop.times
-        return Fraction(times.behind * times.unit + times.rest, times.parts)
+        times = self.period_loop.times
+        return Fraction(times.whole_delay, times.parts)
 
     def stability(
         self,
@@ -181,9 +213,10 @@ class LossMargin:
                 guarantee allows too many patterns.
         """
         guarantee = guarantee or self.guarantee
-        loop = self.loop.under(checked_guarantee(guarantee))
+        if guarantee.longest_burst is None:
+            raise CallerError(f"{guarantee.meaning}: needs a maximum of losses")
         try:
-            bounds = enclose_growth(loop, accuracy, decide=decide, effort=effort)
+            return self._proven(guarantee, accuracy, decide=decide, effort=effort)
         except RefusedError as error:
             raise CallerError(
                 f"network: {guarantee.meaning}: {error}; reduce mansd, the windows of the constraints, "
@@ -194,25 +227,47 @@ class LossMargin:
                 "the loop grows beyond 1e308 within some deliveries, or the units of its states and "
                 "inputs are too different; reduce mansd or the period, or use other units"
             ) from None
-        return self._stability(loop, bounds)
 
-    def _stability(self, loop: PeriodicLoop, bounds: GrowthBounds) -> Stability:
+    def _proven(self, guarantee: LossGuarantee, accuracy: float, *, decide: bool, effort: float) -> Stability:
+        longest = self.between[-1]
+        try:
+            found = prove_growth(
+                self.period_loop, guarantee, accuracy / longest, decide=decide, effort=effort
+            )
+        except NoDocumentError:
+            loop = self.bursts_loop.under(checked_guarantee(guarantee))
+            return self._of_bursts(loop, enclose_growth(loop, accuracy, decide=decide, effort=effort))
+        outcomes = self._from_first([(slot, delivered, units) for delivered, slot, units in found.outcomes])
+        return Stability(
+            found.lower**longest,
+            found.upper**longest,
+            tuple(delivered for _, delivered, _ in outcomes),
+            tuple(self.seconds(units * self._unit) for _, _, units in outcomes),
+            {key: entry for key, entry in (("most", found.most), ("least", found.least)) if entry},
+        )
+
+    def _from_first(self, outcomes: Sequence[tuple[int, bool, int]]) -> list[tuple[int, bool, int]]:
+        """Return the outcomes of a cycle from the slot of the first update on, with a delivery if possible.
+
+        In another slot the pattern may grow less.
+        """
+        begins = [k for k, (slot, _, _) in enumerate(outcomes) if slot == self._first_slot]
+        delivered = [k for k in begins if outcomes[k][1]]
+        begin = next(iter([*delivered, *begins]), 0)
+        return [*outcomes[begin:], *outcomes[:begin]]
+
+    def _of_bursts(self, loop: PeriodicLoop, bounds: GrowthBounds) -> Stability:
         # In another slot than the first update's the pattern may grow less.
         path, slots = bounds.cycle, [burst.slot for burst in bounds.cycle]
         begin = slots.index(self._first_slot) if self._first_slot in slots else 0
         path = path[begin:] + path[:begin]
         pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
-        if path and len(loop.between) == 1:
-            begin = (self._first_slot - path[0].slot) % loop.times.slots % len(pattern)
-            pattern = pattern[begin:] + pattern[:begin]
         units = (steps for burst in path for steps in intervals_of(burst, loop.between))
-        documents = {"stable": bounds.stable, "unstable": bounds.unstable}
         return Stability(
             bounds.lower,
             bounds.upper,
             tuple(pattern),
             tuple(self.seconds(steps * self._unit) for steps in units),
-            {kind: document for kind, document in documents.items() if document is not None},
         )
 
     def coarse_bounds(self, guarantee: LossGuarantee | None = None) -> Stability:

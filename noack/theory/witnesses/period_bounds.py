@@ -15,7 +15,14 @@ from scipy.linalg import cholesky, solve_triangular
 
 from noack.core.linear_systems import Matrix
 from noack.proof.numbers import above
-from noack.proof.period_graph import PeriodEdge, PeriodGraph, exact_value, float_rows, fraction_text
+from noack.proof.period_graph import (
+    PeriodEdge,
+    PeriodGraph,
+    each_step,
+    exact_value,
+    float_rows,
+    fraction_text,
+)
 from noack.theory.witnesses.semidefinite import Accuracy, MatrixInequality, SolverAnswer, minimise
 
 Entry = dict[str, Any]
@@ -217,7 +224,7 @@ class BoundSearch:
     def _factor(self, edge: PeriodEdge) -> str:
         """Return the exact factor by which f1² decays on an edge."""
         graph, factor = self.graph, Fraction(1)
-        for step in edge.steps:
+        for step in each_step(edge.steps):
             if isinstance(step, str) and (i := graph.decaying) is not None:
                 factor *= exact_value(graph.document["steps"][step]["matrix"][i][i])
         return fraction_text(factor**2)

@@ -30,7 +30,7 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         given = shipped("double_integrator", *more)
         search = NetworkSearch(given, DesignRequest(period_s=0.31))
         exact = LossMargin(resolve(search.scenario))
-        loop = exact.loop.under(checked_guarantee(search.guarantee(5)))
+        loop = exact.bursts_loop.under(checked_guarantee(search.guarantee(5)))
         bursts = loop.bursts
         quick = search.quick_loop(search.given_gain).maps(bursts)
         maps = np.array([floats(loop.matrix(burst)) for burst in bursts])
