@@ -7,12 +7,15 @@ delay, and a watchdog that does not act.
 import math
 from fractions import Fraction
 
+import numpy as np
+
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector
 from noack.impairments.kinds.delay import Delay
 from noack.proof.period_times import NEVER, LoopTimes
 from noack.scenario.arrival_ties import WITHOUT_DELAY
-from noack.scenario.resolution import rule_of
+from noack.scenario.resolution import reference_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.theory.coverage import require_exact
 
@@ -23,9 +26,36 @@ _MOST_ON_THEIR_WAY = 40
 def require_covered(resolved: Scenario) -> None:
     """Raise CallerError unless the loop is linear, transmits in time, and the watchdog is idle."""
     resolved.coverage.require_direct_inputs()
-    require_exact(without_timeout(resolved))
+    require_exact(_at_rest(without_timeout(resolved)))
     resolved.coverage.require_constant()
     require_idle_watchdog(resolved)
+
+
+def steady_reference(resolved: Scenario) -> tuple[Vector, Vector] | None:
+    """Return x_r and u_r at t = 0, (n + m,), and how fast they move, of a reference whose input is constant.
+
+    So is that of a set-point, also where the integral of the error is a state: about it, this state moves.
+    None: the reference is another one.
+    """
+    reference, (n, m) = reference_of(resolved), resolved.model.dimensions
+    if reference is None:
+        return np.zeros(n + m), np.zeros(n + m)
+    segment = reference.segments[0]
+    moving = np.zeros((2, n + m))
+    if reference.since_ns or segment.sines.any() or segment.cosines.any() or len(segment.polynomial) > 2:
+        return None
+    moving[: len(segment.polynomial)] = segment.polynomial
+    if moving[1, n:].any() or (np.array(resolved.model.A) @ moving[1, :n]).any():
+        return None
+    return moving[0], moving[1]
+
+
+def _at_rest(resolved: Scenario) -> Scenario:
+    """Return a scenario without its set-point, if what it follows is one: the states are those about it."""
+    if steady_reference(resolved) is None:
+        return resolved
+    controller = resolved.controller.model_copy(update={"reference": None, "setpoint": None})
+    return resolved.model_copy(update={"controller": controller})
 
 
 def without_timeout(scenario: Scenario) -> Scenario:

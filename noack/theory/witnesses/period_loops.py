@@ -12,9 +12,9 @@ from noack.proof.period_document import PeriodDocument, PeriodLoop, PeriodOutput
 from noack.proof.period_graph import PeriodGraph
 from noack.proof.period_times import ArrivalAtTransmissionError
 from noack.scenario.arrival_ties import LATENCY_NS
-from noack.scenario.resolution import loop_of, setpoint_of
+from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.time_triggered.scenario_times import loop_times
+from noack.theory.time_triggered.scenario_times import loop_times, steady_reference
 from noack.theory.witnesses.period_growth import GrowthSearch
 from noack_kernel import GrowthStatement, RejectedError, prove_all
 
@@ -52,8 +52,9 @@ def period_loop(resolved: Scenario, between: range, unit: int) -> PeriodLoop:
             "network.impairments.delay_s: not covered if an update arrives within "
             f"{LATENCY_NS / 1e6:g} ms of a transmission and of a tick; change controller.phase"
         ) from None
-    x_r, u_r = setpoint_of(resolved) or (np.zeros(loop.n), np.zeros(loop.m))
-    push = loop.A @ x_r + loop.B @ u_r
+    followed, rate = steady_reference(resolved) or (np.zeros(loop.n + loop.m),) * 2
+    x_r, u_r = followed[: loop.n], followed[loop.n :]
+    push = loop.A @ x_r + loop.B @ u_r - rate[: loop.n]
     terms = np.abs(loop.A) @ np.abs(x_r) + np.abs(loop.B) @ np.abs(u_r)
     safe = resolved.controller.safe_input
     states = [*loop.state_names, *(f"x{i}" for i in range(len(loop.state_names), loop.n))]
