@@ -1,7 +1,6 @@
 """What was proven, in words; decimals are rounded so that the sentences stay true."""
 
 import json
-from collections.abc import Iterator
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
 from math import isfinite
@@ -12,8 +11,6 @@ from noack_check.proof import Bound, Proof
 
 _SHORT = 7
 """Longest decimal number that is printed as it is, if it stands for exactly that number."""
-
-
 
 
 def quoted(name: str) -> str:

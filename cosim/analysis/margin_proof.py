@@ -19,7 +19,7 @@ from noack.theory.witnesses.loss_margin import LossMargin, Stability, capped
 from noack.theory.witnesses.period_bounds import BoundSearch
 from noack.theory.witnesses.period_growth import GrowthSearch
 from noack.theory.witnesses.period_loops import Entry
-from noack_kernel import GrowthStatement, RejectedError, Statement, prove_all
+from noack_kernel import GrowthStatement, Proven, RejectedError, Statement, prove
 
 _SHARES = (0.5, 0.8, 0.95)
 """Of the rate at which the loop decays: rates of bounds that are tried."""
@@ -70,9 +70,9 @@ def margin_proof(
     bounds = list[Entry]()
     if stable is not None and losses <= stable:
         bounds = files.find_bounds(outputs, losses, found[losses])
-    document, proof, statements = files.proven(bounds, growth)
-    sentences = [*_of_growth(statements[1], margin, stable, unstable)]
-    sentences += [*_of_bounds(statements[0], outputs, losses)]
+    document, proof, proven = files.proven(bounds, growth)
+    sentences = [*_of_growth(proven.growth, margin, stable, unstable)]
+    sentences += [*_of_bounds(proven.bounds, outputs, losses)]
     return MarginProof(sentences, document, proof) if sentences else None
 
 
@@ -140,14 +140,12 @@ class _Files:
             return False
         return True
 
-    def proven(
-        self, bounds: Sequence[Entry], growth: Sequence[Entry]
-    ) -> tuple[str, str, tuple[list[Statement], list[GrowthStatement]]]:
+    def proven(self, bounds: Sequence[Entry], growth: Sequence[Entry]) -> tuple[str, str, Proven]:
         """Return the contents of both files, and what the kernel proves."""
         document = as_text(self._document.table)
         digest = hashlib.sha256(document.encode()).hexdigest()
         proof = as_text({"format": FORMAT, "document": digest, "bounds": bounds, "growth": growth})
-        return document, proof, prove_all(document, proof)
+        return document, proof, prove(document, proof)
 
 
 def _settled(entry: Entry, output: LoopOutput, rate: float) -> float:

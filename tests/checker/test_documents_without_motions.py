@@ -15,7 +15,7 @@ from noack.proof.forms_proof import as_text
 from noack.proof.period_graph import PeriodGraph
 from noack.theory.witnesses.period_bounds import BoundSearch
 from noack.theory.witnesses.period_growth import GrowthSearch
-from noack_kernel import GrowthStatement, RejectedError, Statement, prove_all
+from noack_kernel import GrowthStatement, RejectedError, Statement, prove
 from tests.checker.drive_document import START, drive
 
 Table = dict[str, Any]
@@ -26,7 +26,8 @@ STEPS = 10
 
 
 def proven(document: Table, proof: Table) -> tuple[list[Statement], list[GrowthStatement]]:
-    return prove_all(as_text(document), as_text(proof))
+    found = prove(as_text(document), as_text(proof))
+    return found.bounds, found.growth
 
 
 def proof_of(*bounds: Table, growth: list[Table] | None = None) -> Table:

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from flint import arb
+from noack_check.__main__ import check_file
 
 from cosim.analysis.witnesses import find_statement, resolved_content
 from noack.plants.systems.traced_equations import NotEnclosedError, trace
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.witnesses.coordinates import floats
-from noack_check.__main__ import check_file
 from noack_check.check import RejectedError
 from noack_check.equation_text import equation_lines
 from noack_check.keys import RefusedError

@@ -4,13 +4,13 @@ from typing import Any
 
 import pytest
 from flint import arb, fmpq
+from noack_check.__main__ import check_file
 
 from cosim.analysis.witnesses import resolved_content
 from cosim.simulation.virtual_time import simulate
 from noack.proof.statement_proof import prove_statement
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
-from noack_check.__main__ import check_file
 from noack_check.balls import frobenius
 from noack_check.check import RejectedError
 from noack_check.document import read_number

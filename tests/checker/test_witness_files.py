@@ -6,11 +6,11 @@ import re
 from pathlib import Path
 
 import pytest
+from noack_check.__main__ import check_file, main
 from typer.testing import CliRunner
 
 from cosim.cli.application import app
 from noack.core.errors import ExitStatus
-from noack_check.__main__ import check_file, main
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.scenario import read_loop

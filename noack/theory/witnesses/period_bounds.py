@@ -23,7 +23,7 @@ from noack.proof.period_graph import (
     float_rows,
     fraction_text,
 )
-from noack.theory.witnesses.semidefinite import Accuracy, MatrixInequality, SolverAnswer, minimise
+from noack.proof.semidefinite import Accuracy, MatrixInequality, SolverAnswer, minimise
 
 Entry = dict[str, Any]
 _SOLVED = Accuracy(gap=1e-7, feasibility=1e-8, improves_steps=True)

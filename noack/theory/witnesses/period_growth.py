@@ -21,8 +21,8 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from noack.core.linear_systems import Matrix, Stack, Vector
 from noack.proof.period_graph import PeriodEdge, PeriodGraph, fraction_text
+from noack.proof.semidefinite import Accuracy, MatrixInequality, minimise
 from noack.theory.time_triggered.graph import Graph
-from noack.theory.witnesses.semidefinite import Accuracy, MatrixInequality, minimise
 
 Entry = dict[str, Any]
 Path = tuple[int, ...]

@@ -16,7 +16,7 @@ from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.time_triggered.scenario_times import loop_times, steady_reference
 from noack.theory.witnesses.period_growth import GrowthSearch
-from noack_kernel import GrowthStatement, RejectedError, prove_all
+from noack_kernel import GrowthStatement, RejectedError, prove
 
 Entry = dict[str, Any]
 _ROUNDED = 1e-12
@@ -158,7 +158,8 @@ def prove_growth(
 def _accepted(document: str, entry: Entry) -> GrowthStatement | None:
     """Return what the kernel proves; None: it rejects the entry."""
     try:
-        _, (statement,) = prove_all(document, as_text({"format": FORMAT, "bounds": [], "growth": [entry]}))
+        proof = as_text({"format": FORMAT, "bounds": [], "growth": [entry]})
+        (statement,) = prove(document, proof).growth
     except RejectedError:
         return None
     return statement

@@ -16,7 +16,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.theory.witnesses.loss_margin import LossMargin, capped
-from noack_kernel import prove_all
+from noack_kernel import prove
 
 CASE = Path(__file__).parents[2] / "cases" / "drive_tie.toml"
 SPEED = 50.0
@@ -51,7 +51,7 @@ def proved(resolved: Scenario) -> MarginProof:
 def test_simulated_runs_stay_within_what_is_proven(settings: tuple[str, ...]) -> None:
     resolved = drive(*settings)
     proof = proved(resolved)
-    (bound,), _ = prove_all(proof.document, proof.proof)
+    (bound,) = prove(proof.document, proof.proof).bounds
     assert bound.during_edges
     assert any("; so within 5 rad/s from " in line for line in proof.proven)
     rng, losses = np.random.default_rng(3), resolved.network.mansd
@@ -82,7 +82,7 @@ def test_simulated_runs_stay_within_what_is_proven(settings: tuple[str, ...]) ->
 def test_a_bound_is_about_the_set_point(settings: tuple[str, ...]) -> None:
     """There the integral of the error moves, in a loop whose states are those about the set-point."""
     moved = (*settings, "plant.initial_state=[0.0, 0.0]", SETPOINT)
-    (bound,), _ = prove_all(*proved(drive(*moved))[1:])
+    (bound,) = prove(*proved(drive(*moved))[1:]).bounds
     shares = []
     for seed in range(3):
         run = noack.simulate(load(CASE, ["horizon_s=1.5", f"seeds.loss={seed}", *moved]))
@@ -101,7 +101,8 @@ def test_the_files_of_a_margin_say_what_is_proven_of_some_locations() -> None:
     assert result.destabilised.m == 14
     proof = result.proof
     assert proof is not None
-    (bound,), (most, least) = prove_all(proof.document, proof.proof)
+    found = prove(proof.document, proof.proof)
+    (bound,), (most, least) = found.bounds, found.growth
     assert bound.only is not None
     assert [name for name in bound.only if name.endswith("lost")] == [f"{k} lost" for k in range(4)]
     assert most.only is not None
