@@ -113,11 +113,11 @@ R6_FAULTS: dict[Change, str] = {
     need_nothing_of_the_other: "x: not proven at motion/a/0",
     need_it_on_one_piece_only: "x: not proven at motion/a/1",
     subtract_the_other: "a multiplier below 0",
-    use_a_form_that_is_not_there: "no form 'y' from the start on",
-    use_a_form_in_the_limit: "no form 'y' from the start on",
+    use_a_form_that_is_not_there: "no other form 'y' from the start on",
+    use_a_form_in_the_limit: "no other form 'y' from the start on",
     use_other_nodes: "other nodes in a",
     begin_above: "y: not proven at start",
-    use_its_own_form: "the form's own number is its decay",
+    use_its_own_form: "no other form 'x' from the start on",
     jump_with_the_other: "x: not proven at edge/e/0 0",
 }
 
