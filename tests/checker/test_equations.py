@@ -1,26 +1,25 @@
 """The equations of plants on a region: their enclosure, and witnesses of what stays in it."""
 
-import copy
-import hashlib
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from flint import arb
-from noack_check.__main__ import check_file
 
-from cosim.analysis.witnesses import find_statement, resolved_content
+from cosim.analysis.loop_files import loop_files
+from cosim.analysis.witnesses import find_statement
 from noack.plants.systems.traced_equations import NotEnclosedError, trace
+from noack.proof.equations_claim import equations_text
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.witnesses.coordinates import floats
-from noack_check.check import RejectedError
-from noack_check.equation_text import equation_lines
-from noack_check.keys import RefusedError
 from noack_check.loop import Region
 from noack_equations import RejectedError as RejectedEquationsError
-from noack_equations import enclose
+from noack_equations import enclose, prove_equations
+from noack_kernel import RejectedError as RejectedByKernelError
+from noack_kernel import prove as prove_by_kernel
 from tests.checker.proofs import proved
 from tests.checker.traced_plants import Field, Plant, unexplained
 from tests.oracles.attacked_regions import SCENARIOS, largest_shares, largest_sizes, pendulum
@@ -122,110 +121,6 @@ def test_wrong_equations_are_rejected(steps: Any, rates: Any, reason: str) -> No
         enclose({"steps": steps, "rates": rates}, Region((arb(2),), (arb(1),)))
 
 
-@pytest.fixture(scope="module")
-def witness() -> dict[str, Any]:
-    """Return the file of a witness: a pendulum on a region, ideal conditions."""
-    content = resolved_content(resolve(load(SCENARIOS / "sine_pendulum.toml")))
-    return {"scenario": content, "statements": [proved("sine_pendulum").document]}
-
-
-def test_a_region_is_proven_with_the_equations_in_words(witness: dict[str, Any]) -> None:
-    lines = [*check_file(witness, None, text_of(witness))]
-    assert any("|x_1| ≤ " in line for line in lines)
-    digest = hashlib.sha256(text_of(witness).encode()).hexdigest()
-    assert lines[0].startswith(f'PROVED "sine_pendulum", the plant with the equations {digest[:12]}, ideal')
-    assert lines[-1].startswith(
-        f"       and the plant has the equations with the SHA-256 {digest}: dx_1/dt = "
-    )
-    assert lines[-1].endswith("dx_2/dt = (((sin(x_1) · 9.81) + (−(x_2 · 0.1))) + u_1)")
-
-
-def text_of(witness: dict[str, Any]) -> str:
-    """Return the equations of a witness, as ``noack certify --equations`` writes them."""
-    return "".join(f"{line}\n" for line in equation_lines(witness["statements"][0]["equations"]))
-
-
-def test_equations_are_read_line_by_line(witness: dict[str, Any]) -> None:
-    assert text_of(witness).splitlines() == [
-        "s_5 = sin(x_1)", "s_7 = s_5 · 9.81", "s_9 = x_2 · 0.1", "s_10 = −s_9", "s_11 = s_7 + s_10",
-        "s_12 = s_11 + u_1", "dx_1/dt = x_2", "dx_2/dt = s_12",
-    ]  # fmt: skip
-
-
-def test_a_statement_about_equations_demands_their_file(witness: dict[str, Any]) -> None:
-    with pytest.raises(RejectedError, match=r"equations with the digest [0-9a-f]{64}: give the file"):
-        list(check_file(witness, None))
-    other = text_of(witness).replace("9.81", "9.8")
-    with pytest.raises(RejectedError, match="about other equations than --equations: digest"):
-        list(check_file(witness, None, other))
-    several = f"{other}\n{text_of(witness)}"
-    assert any(line.startswith("PROVED") for line in check_file(witness, None, several))
-    weaker = copy.deepcopy(witness)
-    steps = weaker["statements"][0]["equations"]["steps"]
-    [gravity] = [step for step in steps if step[:1] == ["number"] and step[1] > 9]
-    gravity[1] *= 0.5
-    with pytest.raises(RejectedError, match="about other equations"):
-        list(check_file(weaker, None, text_of(witness)))
-
-
-def change(document: Any, place: tuple[Any, ...], value: Any) -> None:
-    """Set a value in a document."""
-    for key in place[:-1]:
-        document = document[key]
-    document[place[-1]] = value(document[place[-1]]) if callable(value) else value
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "reason"),
-    [
-        (("region", "x", 0), lambda r: 0.5 * r, r"region: x\[0\] may leave it"),
-        (("region", "x", 0), lambda r: 1.6 * r, "flow/"),  # the remainder would be too small
-        (("region", "x", 0), None, "flow/"),
-        (("region", "u", 0), 10.0, r"region: u\[0\] has no bound"),
-        (("region", "x", 1), 10.0, r"region: x\[1\] has no bound"),
-        (("region", "x", 0), -1.0, "not above 0"),
-        (("region", "x"), [1.0], "not 2 sizes of x"),
-        (("region",), {}, "not 2 sizes of x"),
-        (("equations", "steps"), lambda steps: [*steps[:-1], ["number", 1.0]], "flow/|start|drift|x: "),
-        (("plants",), "own", "plant.system.kind"),
-    ],
-)
-def test_false_witnesses_of_a_region_are_rejected(
-    witness: dict[str, Any], place: tuple[Any, ...], value: Any, reason: str
-) -> None:
-    changed = copy.deepcopy(witness)
-    change(changed["statements"][0], place, value)
-    with pytest.raises(ValueError, match=reason):
-        list(check_file(changed, None, text_of(changed)))
-
-
-@pytest.mark.parametrize("names", [["angle"], ["angle", "rate", "time"]])
-def test_each_state_has_a_name_or_none_has(witness: dict[str, Any], names: list[str]) -> None:
-    changed = copy.deepcopy(witness)
-    del changed["scenario"]["outputs"]
-    changed["scenario"]["model"]["state_names"] = names
-    with pytest.raises(RefusedError, match="not 2 names"):
-        list(check_file(changed, None, text_of(changed)))
-
-
-def test_a_stronger_nonlinearity_is_another_plant(witness: dict[str, Any]) -> None:
-    changed = copy.deepcopy(witness)
-    steps = changed["statements"][0]["equations"]["steps"]
-    [gravity] = [step for step in steps if step[:1] == ["number"] and step[1] > 9]
-    gravity[1] *= 1.1
-    with pytest.raises(RejectedError, match="flow/"):
-        list(check_file(changed, None, text_of(changed)))
-
-
-def test_a_bound_of_a_region_has_to_be_there_from_the_start_on(witness: dict[str, Any]) -> None:
-    changed = copy.deepcopy(witness)
-    del changed["statements"][0]["gains"]  # they bound x[0], too, but not below its limit
-    bounds = changed["statements"][0]["bounds"]
-    changed["statements"][0]["bounds"] = [entry for entry in bounds if entry["output"] != "x[0]"]
-    with pytest.raises(RejectedError, match=r"region: x\[0\] has no bound"):
-        list(check_file(changed, None, text_of(changed)))
-
-
 SATURATED = """import numpy as np
 class Saturated:
     def derivative(self, t_s, z, u):
@@ -240,7 +135,6 @@ def test_a_saturated_input_is_proven_to_stay_inside_its_limits(
     (tmp_path / "own.py").write_text(SATURATED.format(limit=limit))
     system = f'plant.system={{kind="python", file="{tmp_path}/own.py", name="Saturated"}}'
     resolved = resolve(load(SCENARIOS / "sine_pendulum.toml", [system]))
-    content = resolved_content(resolved)
     statement = find_statement(resolved, "region", "ideal")
     if not is_proven:  # the first input is 7.5 N m
         assert "|angle| ≤" in statement.reason
@@ -248,13 +142,13 @@ def test_a_saturated_input_is_proven_to_stay_inside_its_limits(
         return
     assert statement.document is not None, statement.reason
     assert statement.document["region"]["u"][0] < limit  # type: ignore[index]
-    bounds = statement.document["bounds"]
-    assert isinstance(bounds, list)
-    del statement.document["gains"]  # they bound u[0], too, but not below its limit
-    less = {**statement.document, "bounds": [entry for entry in bounds if entry["output"] != "u[0]"]}
-    file = {"scenario": content, "statements": [less]}
-    with pytest.raises(RejectedError, match=r"region: u\[0\] has no bound"):
-        list(check_file(file, None, text_of(file)))
+    files = loop_files(resolved, statement)
+    assert files.verify()
+    assert prove_equations(files.document, equations_text(statement.document)).limits
+    proof = json.loads(files.proof)
+    proof["bounds"] = [entry for entry in proof["bounds"] if entry["output"] != "input 0"]
+    with pytest.raises(RejectedByKernelError, match="while input 0: no proven bound is below"):
+        prove_by_kernel(files.document, json.dumps(proof))
 
 
 def test_no_attack_exceeds_what_is_proven_on_a_region() -> None:

@@ -263,6 +263,13 @@ def test_a_document_for_bounds_by_gains_allows_what_equations_do() -> None:
 # The text of equations.
 
 
+def test_equations_are_read_line_by_line() -> None:
+    assert files("sine_pendulum", "ideal")[2].splitlines() == [
+        "s_5 = sin(x_1)", "s_7 = s_5 · 9.81", "s_9 = x_2 · 0.1", "s_10 = −s_9", "s_11 = s_7 + s_10",
+        "s_12 = s_11 + u_1", "dx_1/dt = x_2", "dx_2/dt = s_12",
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(
     "field",
     [
