@@ -57,8 +57,12 @@ def margin_proof(
     Returns:
         None if the loop has no document, or nothing was proven.
     """
-    stable = max((k for k, growth in enumerate(found) if growth.upper < 1 and growth.entries), default=None)
-    unstable = min((k for k, growth in enumerate(found) if growth.lower > 1 and growth.entries), default=None)
+    stable = max(
+        (k for k, growth in enumerate(found) if growth.upper < 1 and "most" in growth.entries), default=None
+    )
+    unstable = min(
+        (k for k, growth in enumerate(found) if growth.lower > 1 and "least" in growth.entries), default=None
+    )
     if stable is None and unstable is None:
         return None
     files = _Files(margin, max(number for number in (stable, unstable) if number is not None))
@@ -68,7 +72,7 @@ def margin_proof(
     if unstable is not None:
         growth.append(dict(found[unstable].entries["least"]))
     bounds = list[Entry]()
-    if stable is not None and losses <= stable:
+    if stable is not None and losses <= stable and found[losses].upper < 1:
         bounds = files.find_bounds(outputs, losses, found[losses])
     document, proof, proven = files.proven(bounds, growth)
     sentences = [*_of_growth(proven.growth, margin, stable, unstable)]

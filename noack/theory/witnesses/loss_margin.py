@@ -27,7 +27,7 @@ from noack.scenario.arrival_ties import LATENCY_NS
 from noack.scenario.scenario import Scenario
 from noack.theory.time_triggered.scenario_times import intervals, require_covered, require_usable_updates
 from noack.theory.witnesses.growth import GrowthBounds, enclose_growth, intervals_of
-from noack.theory.witnesses.period_loops import Entry, period_loop, prove_growth
+from noack.theory.witnesses.period_loops import Entry, ProvenGrowth, period_loop, prove_growth
 from noack_check.growth import Guarantee, PeriodicLoop, read_periodic_loop
 from noack_check.keys import RefusedError
 
@@ -60,6 +60,13 @@ class Stability(NamedTuple):
         if self.upper < 1:
             return "stable"
         return "destabilised" if self.lower > 1 else "undecided"
+
+    def refined(self, other: "Stability") -> "Stability":
+        """Return the same with the other bounds where they are better; they have no entries of a proof."""
+        found = self.with_upper_of(other).with_lower_of(other)
+        changed = {"most": found.upper != self.upper, "least": found.lower != self.lower}
+        kept = {key: entry for key, entry in self.entries.items() if not changed[key]}
+        return found._replace(entries=kept)
 
     def with_upper_of(self, other: "Stability") -> "Stability":
         """Return the same, with the upper bound of a guarantee that allows all these patterns."""
@@ -237,6 +244,16 @@ class LossMargin:
         except NoDocumentError:
             loop = self.bursts_loop.under(checked_guarantee(guarantee))
             return self._of_bursts(loop, enclose_growth(loop, accuracy, decide=decide, effort=effort))
+        stability = self._of_document(found)
+        if len(self.between) == 1 or not decide or stability.verdict != "undecided":
+            return stability
+        loop = self.bursts_loop.under(checked_guarantee(guarantee))
+        return stability.refined(
+            self._of_bursts(loop, enclose_growth(loop, accuracy, decide=decide, effort=effort))
+        )
+
+    def _of_document(self, found: ProvenGrowth) -> Stability:
+        longest = self.between[-1]
         outcomes = self._from_first([(slot, delivered, units) for delivered, slot, units in found.outcomes])
         return Stability(
             found.lower**longest,
@@ -253,8 +270,8 @@ class LossMargin:
         """
         begins = [k for k, (slot, _, _) in enumerate(outcomes) if slot == self._first_slot]
         delivered = [k for k in begins if outcomes[k][1]]
-        begin = next(iter([*delivered, *begins]), 0)
-        return [*outcomes[begin:], *outcomes[:begin]]
+        rotations = [[*outcomes[k:], *outcomes[:k]] for k in delivered or begins or [0]]
+        return min(rotations, key=lambda path: [not is_delivered for _, is_delivered, _ in path])
 
     def _of_bursts(self, loop: PeriodicLoop, bounds: GrowthBounds) -> Stability:
         # In another slot than the first update's the pattern may grow less.
