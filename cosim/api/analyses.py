@@ -12,7 +12,7 @@ from noack.core.progress import no_progress
 from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.resolution import resolve
 from noack.theory.witnesses.effort import MOST_WORK
-from noack.theory.witnesses.growth import ACCURACY
+from noack.theory.witnesses.loss_margin import ACCURACY
 
 
 def certify(

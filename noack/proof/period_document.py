@@ -181,6 +181,7 @@ class PeriodDocument:
         self._steps: dict[str, Table] = {}
         self._places: dict[_PeriodPlace, str] = {}
         self._edges: list[Table] = []
+        self._walked: dict[tuple[_PeriodPlace, int, int | None], list[_Walk]] = {}
         self._most_waiting = 1
         return self._table()
 
@@ -419,6 +420,20 @@ class PeriodDocument:
         self, place: _PeriodPlace, target: _PeriodPlace, periods: int, arrival: int | None, words: str
     ) -> Iterator[_Outcome]:
         """Yield the outcomes until the next transmission; an update arrives after so long, or none does."""
+        # The state of the guarantee makes no difference until then, nor do losses without a timeout.
+        lost = place.lost if self.loop.times.timeout < NEVER else 0
+        key = place._replace(state=(), lost=lost), periods, arrival
+        if key not in self._walked:
+            self._walked[key] = self._walk(place, periods, arrival)
+        after = () if len(self.loop.between) == 1 else (f"{periods} periods",)
+        for walk in self._walked[key]:
+            reached, named = target._replace(waiting=walk.waiting), [words] if words else []
+            yield _Outcome(
+                (*named, *after, *walk.words), tuple(walk.steps), reached, periods, is_lost=words == "lost"
+            )
+
+    def _walk(self, place: _PeriodPlace, periods: int, arrival: int | None) -> list[_Walk]:
+        """Return what may happen until the next transmission."""
         times = self.loop.times
         begin = place.slot * times.period
         end = begin + periods * times.period
@@ -429,8 +444,7 @@ class PeriodDocument:
             events.append((begin + arrival, 2))
         if not (self.loop.knows_start and place.starting == 0):
             events.append((begin, 1))
-        after = () if len(self.loop.between) == 1 else (f"{periods} periods",)
-        walks = [_Walk(begin, place.waiting, (*([words] if words else ()), *after))]
+        walks = [_Walk(begin, place.waiting)]
         has_arrived = False
         for time, kind in sorted(events):
             for walk in walks:
@@ -447,8 +461,7 @@ class PeriodDocument:
         for walk in walks:
             self._move(walk, end)
             self._take(walk, self._end(periods))
-            reached = target._replace(waiting=walk.waiting)
-            yield _Outcome(walk.words, tuple(walk.steps), reached, periods, is_lost=words == "lost")
+        return walks
 
     def _move(self, walk: _Walk, time: int) -> None:
         walk.moved += time - walk.now
@@ -482,7 +495,7 @@ class PeriodDocument:
             return [*walks]
         for walk in walks:
             for late in range(self._late + 1):
-                other = walk.copy()
+                other = walk.copy() if self._late else walk
                 dropped = [slot for steps, slot in walk.waiting if steps >= late]
                 kept = tuple((steps, slot) for steps, slot in walk.waiting if steps < late)
                 used = {slot for _, slot in kept}
