@@ -148,7 +148,7 @@ def end_rows(summary: Mapping[str, Any], delivered_out_of_order: int) -> Iterato
     }
     stale = rejected.pop(("controller", "stale"), 0)
     violated = [f"{claim['what']} ({claim['source']})" for claim in claims if claim["verdict"] == "violated"]
-    bursts = [part for part in loop["assumption_violations"] if part["cause"] == "dropouts"]
+    bursts = [part for part in loop["violations"] if part["cause"] == "dropouts"]
     yield Row("exit status", ending["status"], "", goal=ZERO, note=ending["reason"])
     yield Row("missing samples", loop["missing_samples"], "", goal=ZERO)
     yield Row("unintended losses", loop["unintended_losses"], "", goal=ZERO)

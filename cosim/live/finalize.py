@@ -14,8 +14,14 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from cosim.analysis.claims.claim_evaluation import RunClaims, claims_of, list_violations
-from cosim.analysis.claims.run_certificates import Expectations, expectations, expectations_key, search_limit
+from cosim.analysis.claims.claim_evaluation import RunClaims, claims_of
+from cosim.analysis.claims.run_certificates import (
+    RunCertificate,
+    certificates_key,
+    expected_certificates,
+    search_limit,
+)
+from cosim.analysis.conformance.trace import MOST_ITEMS
 from cosim.analysis.ideal_loop import ideal_loop_part
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay
@@ -63,9 +69,12 @@ _FEW_LOOPS = 4
 """A run with at most this number of loops also gets one report per loop."""
 _LEAST_LOOPS = 8
 """Smallest number of loops that are evaluated together."""
+_LEAST_ITEMS = 500
+"""Each loop of a run has so many steps compared with its loop document in all numbers."""
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are evaluated in less time than processes
 start."""
+Certificates = Sequence[RunCertificate]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -206,7 +215,7 @@ def _evaluate_run(
     """Evaluate every loop and the network; return the summary of the run, and how each loop went."""
     loops, replayed = len(run.names), None
     text = "checking claims" if loops == 1 else f"checking claims of {loops} loops"
-    known = ending.expectations if isinstance(ending, LaunchedEnding) else {}
+    known = ending.certificates if isinstance(ending, LaunchedEnding) else {}
     bare = RunEnding(ending.run_dir, ending.run_id, ending.status, ending.reason, ending.startup_s)
     evaluate = partial(_evaluate_loops, run if pool is None else None, bare)
     blocks = [{number: known.get(number) for number in block} for block in _blocks(run)]
@@ -245,7 +254,7 @@ _stored_run = cache(load_run)
 
 @np.errstate(all="ignore")
 def _evaluate_loops(
-    run: RecordedRun | None, ending: RunEnding, block: Mapping[int, Expectations | None]
+    run: RecordedRun | None, ending: RunEnding, block: Mapping[int, Certificates | None]
 ) -> list[_LoopResults]:
     """Evaluate consecutive loops, given by their numbers with what is known of them already.
 
@@ -255,19 +264,20 @@ def _evaluate_loops(
     loops, numbers = len(run.names), range(min(block), max(block) + 1)
     # The report of one loop uses the claims about the same record.
     records = run.read(numbers) if len(numbers) > 1 else [run.record(numbers[0])]
-    results, known = list[_LoopResults](), dict[str, Expectations]()
+    results, known = list[_LoopResults](), dict[str, Certificates | None]()
     shared = SharedMachines(records if len(records) > 1 else ())
     for record in records:
         if (own := block[record.number]) is None:
-            key = expectations_key(record.scenario)
-            if key not in known:  # equal loops share it
-                known[key] = expectations(record.scenario, loops)
+            key = certificates_key(record.scenario)
+            if key not in known:  # equal loops share them
+                known[key] = expected_certificates(record.scenario, loops)
             own = known[key]
         claims = claims_of(record)
-        claims.certificates, claims.most_work = own.certificates, search_limit(loops)
+        claims.certificates, claims.most_work = own, search_limit(loops)
+        claims.most_items = max(MOST_ITEMS // loops, _LEAST_ITEMS)
         phase_ns = run.phases_ns[record.number]
         status, reason = int(ending.status), ending.reason
-        summary = summarise_loop(record, status, reason, phase_ns, own.assumptions)
+        summary = summarise_loop(record, status, reason, phase_ns)
         if loops == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
@@ -311,8 +321,8 @@ def _claim_results(claims: RunClaims, summary: LoopSummary) -> dict[str, Any]:
         "allowed": _allowed(claims.allowed),
         "certified_for": _allowed(claims.certified_for),
         "claims": claims.evaluate(),
+        "conformance": claims.conformance(),
         "judged_until_s": claims.judged_until_s,
-        "assumption_violations": list_violations(summary.assumption_violations, claims.violations()),
         "longest_loss_burst": longest,
     }
 

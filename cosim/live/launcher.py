@@ -122,7 +122,7 @@ def launch(
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
         startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
         ending.store(status, reason, startup_s)
-    return LaunchedEnding(run_dir, access.run_id, status, reason, startup_s, expectations=certificates.known)
+    return LaunchedEnding(run_dir, access.run_id, status, reason, startup_s, certificates=certificates.known)
 
 
 def _coordinate(

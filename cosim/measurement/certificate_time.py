@@ -12,8 +12,7 @@ about a run count them: by the rules of the guarantee, and
   until it is received.
 
 A packet that arrives out of order counts as lost if the newer one arrives after the allowed delay.
-A claim about a run is void from the first violation on, since its bounds depend on all that
-happened before.
+A bound of a run holds up to the first violation only, since it depends on all that happened before.
 """
 
 from collections.abc import Iterator
@@ -22,7 +21,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.observed_conditions import PacketLosses, causes_of
+from cosim.analysis.claims.observed_conditions import PacketLosses
 from cosim.analysis.claims.run_certificates import scheduled_certificates
 from cosim.measurement.loss_bursts import Outcomes, outcomes
 from noack.scenario.resolution import resolve
@@ -72,7 +71,7 @@ class CertificateTime:
 
     @property
     def first_s(self) -> float | None:
-        """When a condition was first violated, None if never: a claim is void from then on."""
+        """When a condition was first violated, None if never: bounds hold up to then."""
         return min((cause.first_s for cause in self.causes), default=None)
 
     @property
@@ -103,9 +102,9 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     resolved.coverage.require_constant()
     # The certificates, and why there are none for some plants.
     certificates: dict[str, str | None] = {}
-    if not causes_of(resolved):
+    if resolved.protocol.acknowledges:
         certificates["any plant"] = "a loop with acknowledgements cannot have one"
-    for certificate in scheduled_certificates(resolved):
+    for certificate in (each.certificate for each in scheduled_certificates(resolved)):
         certificates[certificate.scope] = certificate.void
     # The intervals in which each of their conditions was violated.
     limits = allowed_conditions(resolved)

@@ -106,7 +106,7 @@ def _paper(results: Certificates) -> Iterator[Block]:
 
 
 def _few_lines(results: Certificates) -> Iterator[Sentence]:
-    """Yield the bounds of the outputs and of ‖x‖, what they assume, and what would void them."""
+    """Yield the bounds of the outputs and of ‖x‖, and what they assume."""
     certificate = results.guaranteed
     if certificate is not None:
         bounds = results.stated_bounds(certificate)

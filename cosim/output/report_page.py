@@ -16,13 +16,13 @@ import numpy as np
 from cosim.analysis.summary.loops_over_time import LoopOverTime
 from cosim.analysis.summary.run_summary import worst_loop
 from cosim.analysis.summary.summary_model import LoopSummary, RunSummary
+from cosim.output.conformance_words import conformance_text
 from cosim.output.document import Block, Document, Folded, Heading, Sentence
 from cosim.output.figures.network_figures import network_figures
 from cosim.output.figures.page_figure import PageFigure
 from cosim.output.figures.run_figures import envelopes, run_figures
 from cosim.output.page_kit import TERMS, document_page, value_text, words
 from cosim.output.result_tables import KEY_VALUE, ResultTable
-from cosim.output.run_document import assumption_table
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
     badness,
@@ -157,7 +157,7 @@ def report_document(report: Report) -> Document:
     shares = report.shares_network
     sections = [
         *([_network, _loops, _worst_loop] if shares else [_remarks]),
-        _signals, _numbers, _claims, _assumptions, _timing, _replay, _scenario, _words,
+        _signals, _numbers, _claims, _timing, _replay, _scenario, _words,
     ]  # fmt: skip
     return Document(
         title=report.summary.scenario,
@@ -183,7 +183,7 @@ def _network(report: Report) -> Iterator[Block]:
 
 def _loops(report: Report) -> Iterator[Block]:
     loops = sorted(report.summary.loops, key=badness, reverse=True)
-    order = "Failed loops come first; the others by violated and void claims, burst and ‖e_c‖"
+    order = "Failed loops come first; the others by claims violated, ended or unchecked, burst and ‖e_c‖"
     yield Heading("Loops")
     yield Sentence(
         text="A name with a link has a report of its own. That of another loop is written by “noack report "
@@ -220,17 +220,17 @@ def _claims(report: Report) -> Iterator[Block]:
     yield Sentence(
         text="The claims about this run, and what was observed. Share used is the largest share of the bound "
         "that the run reached; a bound that is computed from the run itself is reached by construction. "
-        "Void: the run violated a condition of the claim, which was checked until then. Not applicable: the "
-        "run exceeded the bound, but does not meet its assumption, and so does not refute it."
+        "Ended: the bound held until then, and nothing is claimed of the time after. Unchecked: nothing was "
+        "compared. Not applicable: the run exceeded the bound, but does not meet its assumption, and so does "
+        "not refute it."
     )
-    yield claims_in_full(report.loop.claims)
+    yield from (Sentence(text=_sentence(conformance_text(part))) for part in report.loop.conformance)
+    yield claims_in_full(report.loop)
     yield from map(_capitalized, schedule_tables(report.loop))
 
 
-def _assumptions(report: Report) -> Iterator[Block]:
-    if report.loop.assumptions:
-        yield Heading("Assumptions")
-        yield assumption_table(report.loop.assumptions)
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _timing(report: Report) -> Iterator[Block]:

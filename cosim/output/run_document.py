@@ -12,7 +12,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from cosim.analysis.summary.run_summary import Outcome
-from cosim.analysis.summary.summary_model import AssumptionPart, Claim, LoopSummary, RunSummary
+from cosim.analysis.summary.summary_model import ClaimVerdict, LoopSummary, RunSummary
+from cosim.output.claim_words import claim_reason
+from cosim.output.conformance_words import conformance_text
 from cosim.output.document import Block, Document, Sentence, SentenceRole
 from cosim.output.result_tables import KEY_VALUE, ResultTable, Tone
 from cosim.output.run_tables import (
@@ -61,16 +63,14 @@ def run_document(outcome: Outcome, *, verbose: bool = False) -> Document:
 
 
 def _details(summary: RunSummary) -> list[Block]:
-    """Return everything that the summary of one loop has: numbers, timing, assumptions, claims."""
+    """Return everything that the summary of one loop has: numbers, timing, conformance, claims."""
     (loop,), tables = summary.loops, {table.name: table for table in summary_tables(summary)}
     blocks: list[Block] = [tables["numbers"]]
     if "timing" in tables:
         blocks += [tables["timing"], *_realtime(loop.realtime)]
-    blocks += [
-        Sentence(text="assumptions about this scenario:"), assumption_table(loop.assumptions)
-    ]  # fmt: skip
+    blocks += [Sentence(text=conformance_text(part), is_prose=True) for part in loop.conformance]
     if "claims" in tables:
-        blocks += [tables["claims"], *_notes_on_claims(loop.claims)]
+        blocks += [tables["claims"], *_notes_on_claims(loop)]
     return [*blocks, *([tables["schedule"]] if "schedule" in tables else [])]
 
 
@@ -83,7 +83,7 @@ def _loops(summary: RunSummary, *, verbose: bool) -> list[Block]:
     more = len(summary.loops) - len(loops)
     more_text = f"and {counted(more, 'more loop')}: --verbose shows all"
     return [
-        *(Sentence(text=line) for line in _void_lines(summary.loops)),
+        *(Sentence(text=line) for line in _ended_lines(summary.loops)),
         ResultTable("network", f"network of {run_title(summary)}", KEY_VALUE, network_rows(summary)),
         loops_table(loops, title)._replace(is_dense=True),
         Sentence(text=LOOPS_CAPTION, role=SentenceRole.NOTE),
@@ -91,14 +91,16 @@ def _loops(summary: RunSummary, *, verbose: bool) -> list[Block]:
     ]
 
 
-def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
-    """Return why claims are void, and in which loops; nothing if that is in the verdict.
+def _ended_lines(loops: Sequence[LoopSummary]) -> list[str]:
+    """Return why claims ended or were not checked, and in which loops; nothing if that is in the verdict.
 
     Reasons that differ only in numbers are one.
     """
     reasons = defaultdict[str, list[tuple[str, str]]](list)
     for loop in loops:
-        for why in sorted({claim.why for claim in loop.claims if claim.verdict == "void"}):
+        verdicts = (ClaimVerdict.ENDED, ClaimVerdict.UNCHECKED)
+        ended = [claim for claim in loop.claims if claim.verdict in verdicts]
+        for why in sorted({claim_reason(claim, loop.conformance) for claim in ended}):
             reasons[_NUMBER.sub("#", why)].append((why, loop.name))
     if len(reasons) == 1:
         return []
@@ -106,7 +108,7 @@ def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
     for alike in sorted(reasons.values(), key=lambda alike: -len({name for _, name in alike})):
         names = [*dict.fromkeys(name for _, name in alike)]
         where = names[0] if len(names) == 1 else f"{len(names)} loops"
-        lines.append(f"void: {_with_ranges([why for why, _ in alike])} ({where})")
+        lines.append(f"claims ended or unchecked: {_with_ranges([why for why, _ in alike])} ({where})")
     more = len(lines) - _MOST_REASONS
     if more > 0:
         reasons_word = "reason" if more == 1 else "reasons"
@@ -124,8 +126,9 @@ def _with_ranges(texts: Sequence[str]) -> str:
     return _NUMBER.sub(lambda _: next(following), texts[0])
 
 
-def _notes_on_claims(claims: Sequence[Claim]) -> Iterator[Sentence]:
+def _notes_on_claims(loop: LoopSummary) -> Iterator[Sentence]:
     """Yield what the words of the table of claims mean, and why claims did not hold."""
+    claims = loop.claims
     if any(claim.ratio is not None for claim in claims):
         yield Sentence(
             role=SentenceRole.NOTE,
@@ -137,8 +140,8 @@ def _notes_on_claims(claims: Sequence[Claim]) -> Iterator[Sentence]:
         )
     sources: dict[tuple[str, str], list[str]] = {}
     for claim in claims:
-        if claim.verdict != "held" and claim.why:
-            sources.setdefault((claim.verdict, claim.why), []).append(claim.origin)
+        if reason := claim_reason(claim, loop.conformance):
+            sources.setdefault((claim.verdict, reason), []).append(claim.origin)
     for (word, reason), claim_sources in sources.items():
         text = f"{word}: {'; '.join(dict.fromkeys(claim_sources))}: {reason}"
         yield Sentence(text=text, is_prose=True)
@@ -158,7 +161,7 @@ def _realtime(realtime: dict[str, dict[str, str]]) -> Iterator[Sentence]:
         yield Sentence(text=f"real-time settings{whose}: {text}", is_prose=True)
 
 
-def assumption_table(assumptions: Sequence[Assumption | AssumptionPart]) -> ResultTable:
+def assumption_table(assumptions: Sequence[Assumption]) -> ResultTable:
     """Return assumptions with their verdicts."""
     rows = []
     for assumption in assumptions:

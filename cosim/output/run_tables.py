@@ -12,6 +12,7 @@ from cosim.analysis.summary.plant_linearisation import linearisation_rows
 from cosim.analysis.summary.summary_model import (
     ChangePart,
     Claim,
+    ClaimVerdict,
     DeadlinesPart,
     IdealLoopPart,
     LoopSummary,
@@ -22,6 +23,7 @@ from cosim.analysis.summary.summary_model import (
     RunSummary,
     WatchdogPart,
 )
+from cosim.output.claim_words import claim_reason
 from cosim.output.result_tables import KEY_VALUE, ResultTable, Tone
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
@@ -40,7 +42,8 @@ LOOPS_CAPTION = (
     "forwarded bytes; delay and ‖e_c‖: largest"
 )
 _CLAIM_TONES = {
-    "held": Tone.GOOD, "violated": Tone.BAD, "void": Tone.DOUBTFUL, "not applicable": Tone.QUIET,
+    "held": Tone.GOOD, "violated": Tone.BAD, "ended": Tone.DOUBTFUL, "unchecked": Tone.DOUBTFUL,
+    "not applicable": Tone.QUIET,
 }  # fmt: skip
 _SCHEDULE = {
     "sampling_s": "between two measurements",
@@ -189,7 +192,7 @@ def _losses(summary: RunSummary, loop: LoopSummary) -> Iterator[tuple[str, str]]
             yield f"{name} lost", f"{sent.lost} ({ratio(sent.lost, sent.sent)})"
             yield f"longest loss burst of {name}", str(sent.longest_loss_burst)
     yield burst_row(max(caps(summary)), summary.constraints, loop.longest_loss_burst)
-    violated = [violation.cause for violation in loop.assumption_violations]
+    violated = [violation.cause for violation in loop.violations]
     yield "loss bursts beyond M − 1", str(violated.count("dropouts"))
     for constraint in summary.constraints:
         yield f"violations of {constraint}", str(violated.count(constraint))
@@ -301,20 +304,26 @@ def _claims_table(claims: Claims, title: str) -> ResultTable:
     headings = ("source", "claim", *(["interval"] if has_interval else []), "share used", "verdict")
     rows = []
     for claim, interval in zip(claims, intervals, strict=True):
-        since = "" if claim.since_s is None else f" since {claim.since_s:.3f} s"
         share = NONE if claim.ratio is None else f"{100 * claim.ratio:.3g} %"
         rows.append(
-            (claim.origin, claim.bound, *(interval if has_interval else ()), share, claim.verdict + since)
+            (claim.origin, claim.bound, *(interval if has_interval else ()), share, verdict_text(claim))
         )
     left = [i for i, heading in enumerate(headings) if heading != "share used"]
     return ResultTable("claims", title, headings, rows, left=left, tones=_CLAIM_TONES)
 
 
-def claims_in_full(claims: Claims) -> ResultTable:
-    """Return the table of claims with their bounds in words and numbers, for a page."""
+def verdict_text(claim: Claim) -> str:
+    """Return the verdict of a claim, with its time."""
+    if claim.since_s is None or claim.verdict is ClaimVerdict.UNCHECKED:
+        return str(claim.verdict)
+    word = "at" if claim.verdict is ClaimVerdict.ENDED else "since"
+    return f"{claim.verdict} {word} {claim.since_s:.3f} s"
+
+
+def claims_in_full(loop: LoopSummary) -> ResultTable:
+    """Return the table of a loop's claims with their bounds in words and numbers, for a page."""
     rows = []
-    for claim in claims:
-        since = "" if claim.since_s is None else f" since {claim.since_s:.3f} s"
+    for claim in loop.claims:
         what = ", ".join(filter(None, (claim.what, interval_text(claim))))
         share = NONE if claim.ratio is None else f"{number(100 * claim.ratio)} %"
         numbers = (
@@ -322,7 +331,16 @@ def claims_in_full(claims: Claims) -> ResultTable:
             number(claim.observed, 4),
             share,
         )
-        rows.append((what, claim.origin, claim.bound, *numbers, claim.why, claim.verdict + since))
+        rows.append(
+            (
+                what,
+                claim.origin,
+                claim.bound,
+                *numbers,
+                claim_reason(claim, loop.conformance),
+                verdict_text(claim),
+            )
+        )
     headings = ("claim", "source", "bound", "certified", "observed", "share used", "why", "verdict")
     caption = "Bounds, compared with the run"
     return ResultTable("", caption, headings, rows, left=(0, 1, 2, 6, 7), tones=_CLAIM_TONES)
@@ -340,7 +358,7 @@ def _replay(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:
 
 
 def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
-    """Yield the table of the times on which certificates depend, if the loop can have any."""
+    """Yield the table of the times on which proofs depend, if the loop can have any."""
     if (allowed := loop.allowed) is None or (observed := loop.conditions) is None:
         return
     exists = any(claim.is_certified and claim.has_bound for claim in loop.claims)
@@ -386,7 +404,7 @@ def badness(loop: LoopSummary) -> tuple[float, ...]:
     return (
         loop.exit.status != ExitStatus.OK,
         claims["violated"],
-        claims["void"],
+        claims["ended"] + claims["unchecked"],
         loop.longest_loss_burst,
         float("inf") if error is None else error,
     )

@@ -8,26 +8,27 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from cosim.analysis.claims.observed_conditions import CAUSES, SCHEDULE, worst_time
+from cosim.analysis.conformance.verdicts import Failed
 from cosim.analysis.summary.summary_model import (
     Claim,
+    ClaimCause,
+    ClaimVerdict,
     ExitPart,
     IdealLoopPart,
     LoopSummary,
     OutputPart,
     RunSummary,
 )
+from cosim.output.claim_words import claim_reason
 from cosim.output.document import Sentence, SentenceRole
 from cosim.output.result_tables import Tone
 from cosim.output.run_tables import changes_in, shares_network, state_norm
 from cosim.simulation.continuous import ContinuousSummary
 from noack.core.errors import ExitStatus
 from noack.core.number_format import counted, duration_at_least, number
-from noack.protocol.roles import RECORDER
 from noack.protocol.wire_format import Rejection
 from noack.runtime.end_reasons import HORIZON
 from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
-from noack.theory.certificates.assumptions import LINEAR_PLANT, AssumptionStatus
 
 _MOST_NAMED = 3
 """Largest number of claims of a verdict that are named."""
@@ -241,6 +242,8 @@ class GuaranteeVerdict(NamedTuple):
     """Why it is not; if it is kept, what limits it."""
     lacks_certificate: bool = False
     """Whether there is no certificate."""
+    is_of_conformance: bool = False
+    """Whether the run conforms up to this time only."""
 
 
 def guarantee_of(loop: LoopSummary) -> GuaranteeVerdict:
@@ -254,8 +257,8 @@ def guarantee_of(loop: LoopSummary) -> GuaranteeVerdict:
 
 def _if_broken(loop: LoopSummary) -> GuaranteeVerdict | None:
     """Return since when and why the guarantee is broken; None if it is not."""
-    broken = [(part.t_s, part.what) for part in loop.assumption_violations if part.cause not in CAUSES]
-    violated = [claim for claim in loop.claims if claim.verdict == "violated"]
+    broken = [(part.t_s, part.what) for part in loop.violations]
+    violated = [claim for claim in loop.claims if claim.verdict is ClaimVerdict.VIOLATED]
     if violated:
         named = list(dict.fromkeys(claim.what for claim in violated))
         more = [f"{len(named) - _MOST_NAMED} more"] if len(named) > _MOST_NAMED else []
@@ -267,26 +270,28 @@ def _if_broken(loop: LoopSummary) -> GuaranteeVerdict | None:
 def _if_kept(loop: LoopSummary) -> GuaranteeVerdict | None:
     """Return what limits the guarantee that was kept.
 
-    None if no certificate claims anything, or if some claims are void and no claim of a certificate held.
-    One certificate that held is enough: what is void besides is a limit.
+    None if no certificate claims anything, or if some claims ended or were not checked and no claim of a
+    certificate held. One certificate that held is enough: what ended besides is a limit.
     """
     certified = [claim for claim in loop.claims if claim.is_certified]
     if not certified:
         return None
     coverage = "; ".join(filter(None, (_certified_times(loop), _end_of_certificates(loop))))
-    if not (void := _void_claims(loop)):
+    if not (ended := _ended_claims(loop)):
         return GuaranteeVerdict(Tone.GOOD, 0.0, coverage)
-    if not any(claim.verdict == "held" for claim in certified):
+    if not any(claim.verdict is ClaimVerdict.HELD for claim in certified):
         return None
-    limits = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {_reason(loop).why}"
-    return GuaranteeVerdict(Tone.GOOD, 0.0, "; ".join(filter(None, (coverage, limits))))
+    many = f"{len(ended)} {'claim' if len(ended) == 1 else 'claims'} not checked to the end"
+    return GuaranteeVerdict(
+        Tone.GOOD, 0.0, "; ".join(filter(None, (coverage, f"{many}: {_reason(loop).why}")))
+    )
 
 
 def _if_not_checkable(loop: LoopSummary) -> GuaranteeVerdict:
     """Return from when on and why the guarantee cannot be checked."""
     if any(claim.is_certified for claim in loop.claims):
         return _reason(loop)
-    why = next((claim.why for claim in _void_claims(loop)), "")
+    why = next((claim_reason(claim, loop.conformance) for claim in _ended_claims(loop)), "")
     return GuaranteeVerdict(Tone.DOUBTFUL, 0.0, why or "no certificate covers this loop")
 
 
@@ -302,39 +307,31 @@ def is_covered(loop: LoopSummary) -> bool:
     )
 
 
-def _void_claims(loop: LoopSummary) -> list[Claim]:
-    return [claim for claim in loop.claims if claim.verdict == "void"]
+def _ended_claims(loop: LoopSummary) -> list[Claim]:
+    """Return the claims that ended before the end of the run, or of which nothing was compared."""
+    return [claim for claim in loop.claims if claim.verdict in (ClaimVerdict.ENDED, ClaimVerdict.UNCHECKED)]
 
 
-def _void_if_none_held(loop: LoopSummary) -> list[Claim]:
-    """Return the void claims of certificates, if no claim of a certificate held."""
+def _ended_if_none_held(loop: LoopSummary) -> list[Claim]:
+    """Return such claims of certificates, if no claim of a certificate held."""
     certified = [claim for claim in loop.claims if claim.is_certified]
-    if any(claim.verdict == "held" for claim in certified):
+    if any(claim.verdict is ClaimVerdict.HELD for claim in certified):
         return []
-    return [claim for claim in certified if claim.verdict == "void"]
+    return [claim for claim in _ended_claims(loop) if claim.is_certified]
 
 
 def _reason(loop: LoopSummary) -> GuaranteeVerdict:
-    """Return from when on, and why, the first of the void claims of a loop cannot be checked."""
-    uncovered = _void_if_none_held(loop)
+    """Return from when on, and why, the first of the ended claims of a loop says nothing more."""
+    uncovered = _ended_if_none_held(loop)
     # A certificate that covered the run for some time says more than one that does not exist.
-    candidates = [claim for claim in uncovered if claim.has_bound] or uncovered or _void_claims(loop)
+    candidates = [claim for claim in uncovered if claim.has_bound] or uncovered or _ended_claims(loop)
+    reasons = [(claim_reason(claim, loop.conformance), claim) for claim in candidates]
     # Of equal times, the certificate of the scenario's own plant gives the reason, as in noack certify.
-    claim = min(
-        candidates, key=lambda claim: (claim.since_s or 0.0, claim.source == "box certificate", _why(claim))
+    reason, claim = min(
+        reasons, key=lambda pair: (pair[1].since_s or 0.0, pair[1].source == "box certificate", pair[0])
     )
-    reason, late = _why(claim), _lateness(loop)
-    if late and late[0] == reason:
-        reason = f"{reason}; {_what_does_not_cover(loop, claim)}"
-    return GuaranteeVerdict(Tone.DOUBTFUL, claim.since_s or 0.0, reason, claim.lacks_certificate)
-
-
-def _what_does_not_cover(loop: LoopSummary, claim: Claim) -> str:
-    """Return which certificates do not cover the lateness of a loop, of which a claim is void."""
-    if _is_incomplete(loop):
-        return "no certificate was computed for that, because the record is incomplete"
-    covered = any(other.is_certified and other.verdict == "held" for other in loop.claims)
-    return f"the {claim.source} does not cover that" if covered else "no certificate covers that"
+    conforms = claim.cause is ClaimCause.CONFORMANCE
+    return GuaranteeVerdict(Tone.DOUBTFUL, claim.since_s or 0.0, reason, claim.lacks_certificate, conforms)
 
 
 def _is_incomplete(loop: LoopSummary) -> bool:
@@ -342,18 +339,17 @@ def _is_incomplete(loop: LoopSummary) -> bool:
     return bool(loop.missing_samples) or (loop.replay is not None and not loop.replay.complete)
 
 
-def _why(claim: Claim) -> str:
-    return claim.why if claim.has_bound else f"no certificate: {claim.why}"
+_OF_LATENESS = (Failed.LIMIT, Failed.WHEN, Failed.INPUT)
+"""What a run that is late fails by."""
 
 
-def _lateness(loop: LoopSummary) -> list[str]:
-    """Return how the loop was later than its scenario allows."""
-    return [part.what for part in loop.assumption_violations if part.cause in SCHEDULE]
-
-
-def _is_late(loop: LoopSummary, claim: Claim) -> bool:
-    """Whether a claim is void because the loop was too late for it."""
-    return claim.why in _lateness(loop)
+def _late_sources(loop: LoopSummary) -> list[str]:
+    """Return the certificates for whose documents the run was too late."""
+    return [
+        part.certificate
+        for part in loop.conformance
+        if part.failure is not None and part.failure.kind in _OF_LATENESS
+    ]
 
 
 def _certified_times(loop: LoopSummary) -> str:
@@ -375,8 +371,7 @@ def _end_of_certificates(loop: LoopSummary) -> str:
 
 def _covers_lateness(loop: LoopSummary) -> bool:
     """Whether certificates of its lateness cover the whole run."""
-    late = any(_is_late(loop, claim) for claim in _void_claims(loop))
-    return loop.certified_for is not None and not late
+    return loop.certified_for is not None and not _late_sources(loop)
 
 
 def _guarantee_line(loops: Sequence[LoopSummary]) -> Sentence:
@@ -401,6 +396,8 @@ def _guarantee_line(loops: Sequence[LoopSummary]) -> Sentence:
         text = f"guarantee broken{where} since {since}{why}"
     elif len(loops) > 1:
         text = f"guarantee not checkable in {count} loops{why}"
+    elif kept.is_of_conformance and kept.since_s > 0:
+        text = f"conforms until {since}{why}; the bounds hold until then"
     elif kept.since_s > 0:
         text = f"guarantee kept until {since}, then not checkable{why}"
     else:
@@ -412,22 +409,11 @@ def remarks(summary: RunSummary) -> Iterator[Sentence]:
     """Yield the remarks on one loop, the severe ones first; none if all went well."""
     (loop,) = summary.loops
     reason = guarantee_of(loop).why
-    violations = [
-        violation
-        for violation in loop.assumption_violations
-        if violation.what not in reason and not (violation.cause in SCHEDULE and _covers_lateness(loop))
-    ]
+    violations = [violation for violation in loop.violations if violation.what not in reason]
     for violation in violations[:_MOST_VIOLATIONS]:
-        is_reported = violation.process != RECORDER
-        source = f"reported by {violation.process}" if is_reported else "found in the record"
-        where = f"from t = {violation.t_s:.3f} s on ({source})"
-        what = violation.what + worst_time(violation.t_s, violation.worst_at_s)
-        severe = violation.cause not in CAUSES  # the guarantee, or a change
-        text = f"assumption violated {where}: {what}"
-        yield _severe(text) if severe else _warning(text)
+        yield _severe(f"{violation.process} reported at {violation.t_s:.3f} s: {violation.what}")
     if (more := len(violations) - _MOST_VIOLATIONS) > 0:
-        plural = "s" if more > 1 else ""
-        yield _severe(f"{more} more violation{plural} of an assumption")
+        yield _severe(f"{counted(more, 'more report')} of this kind")
     if loop.replay is not None and loop.replay.bit_exact is False:
         yield _severe("the replay of the run differs from its record")
     yield from map(_warning, _warnings(summary, loop))
@@ -450,11 +436,6 @@ def _has_clocks(loop: LoopSummary) -> bool:
 
 
 def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
-    held = any(claim.is_certified and claim.verdict == "held" for claim in loop.claims)
-    for part in loop.assumptions:
-        is_of_plant = part.what == LINEAR_PLANT  # a certificate of its equations does not need it
-        if part.verdict == AssumptionStatus.VIOLATED and not (is_of_plant and held):
-            yield f"assumption violated: {part.what} ({part.source}): {part.why}"
     yield from loop.uneven_periods
     plant = loop.lateness_us.get("plant")
     if plant and plant.late_steps > _MOST_LATE * plant.steps:
@@ -484,12 +465,12 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
             "no bound of ‖x‖ is certified: noack certify shows what would have to change; "
             "noack margin shows whether a time-triggered loop is proven stable"
         )
-    late = [claim for claim in _void_claims(loop) if _is_late(loop, claim)]
+    late = _late_sources(loop)
     ended_well = summary.exit.status != ExitStatus.FAILED and not _is_incomplete(loop)
     if late and ended_well and summary.kind == "live":
         culprit = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
         covered = any(claim.is_certified and claim.verdict == "held" for claim in loop.claims)
-        sources = " and the ".join(dict.fromkeys(claim.source for claim in late))
+        sources = " and the ".join(dict.fromkeys(late))
         certificate = f"the {sources}" if covered else "any certificate"
         yield (
             f"{culprit} was later than {certificate} of this loop allows, so some claims were not "

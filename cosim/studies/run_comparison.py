@@ -262,7 +262,8 @@ _NUMBERS: dict[str, Callable[[LoopSummary], float | None]] = {
     "deadlines missed": _count_late_steps,
     "claims held": _claims("held"),
     "claims violated": _claims("violated"),
-    "claims void": _claims("void"),
+    "claims ended": _claims("ended"),
+    "claims unchecked": _claims("unchecked"),
 }
 
 

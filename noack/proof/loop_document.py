@@ -166,6 +166,7 @@ class LoopDocument:
             "edges": [*edges, *self._silent_edges(), *self.dead_edges],
             "start": self._start(),
             "outputs": self.outputs,
+            "readings": self._readings(),
         }
         if self.has("f1"):
             self.table["decaying"] = {"coordinate": "f1", "rate": exact(rate)}
@@ -572,6 +573,24 @@ class LoopDocument:
         return [
             [as_written(float(rows[i, j].mid())) for j in range(rows.ncols())] for i in range(rows.nrows())
         ]
+
+    def _readings(self) -> Table:
+        """Return what a record shows of z: x, and x_s and x_c where z has all of their entries."""
+        model, places = self.model, self.model.locations
+        every = [place.name for place in places]
+        found = {"x": [{"rows": self.columns(model.x), "in": every}]}
+        if not model.sees_all:
+            return found
+        # Where updates of a periodic rule are lost, e is x_c − x.
+        sensed = [name for name in every if not (model.is_periodic and name.endswith("lost"))]
+        driven = [name for name in every if not name.startswith("start")]
+        for reading, rows, where in (
+            ("x_s", model.x + model.e, sensed),
+            ("x_c", model.x + model.e + model.w, driven),
+        ):
+            if where:
+                found[reading] = [{"rows": self.columns(rows), "in": where}]
+        return found
 
     def _limits(self) -> Iterator[Table]:
         """Yield the limits of a region; each is one of an output that is bounded."""

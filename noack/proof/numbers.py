@@ -35,6 +35,8 @@ def exact(value: arb | fmpq | float | int) -> Number:
 
 def entry(value: arb | fmpq) -> Number | list[float]:
     """Return an exact number, or the interval of a ball, rounded outwards."""
+    if value == 0:  # most entries are
+        return 0
     if not isinstance(value, arb) or value.is_exact():
         return exact(value)
     low, high = (to_fraction(end) for end in (value.lower(), value.upper()))

@@ -206,12 +206,12 @@ def the_loop_computes_what_it_should(run: Attacked) -> Iterator[str]:
 
 
 def no_claim_is_violated(run: Attacked) -> Iterator[str]:
-    """No claim is violated; claims may be void because of deadlines missed on a busy machine."""
+    """No claim is violated; claims may end because of deadlines missed on a busy machine."""
     claims = run.summary["loops"][0]["claims"]
     if not any("state" in claim["what"] and claim["certified"] is not None for claim in claims):
         yield "no envelope of the state is claimed"
     yield from (str(claim) for claim in claims if claim["verdict"] == "violated")
-    violations = run.summary["loops"][0]["assumption_violations"]
+    violations = run.summary["loops"][0]["violations"]
     yield from (str(violation) for violation in violations if violation["cause"] == "dropouts")
 
 

@@ -2,8 +2,8 @@
 
 The identity (I1) holds for every plant, trigger and network. The paper's theorems assume a
 continuous trigger, and a network without delay. A certificate claims bounds of the errors, the
-state and the inter-event time: each is evaluated for each certificate of the scenario, and is void
-from the first violation of the certificate's conditions on.
+state and the inter-event time: each is compared for each certificate of the scenario, as long as the run
+conforms to the certificate's loop document.
 """
 
 from collections.abc import Callable
@@ -12,8 +12,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims.observed_conditions import Reals, VoidFrom, earliest
-from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
+from cosim.analysis.claims.observed_conditions import Reals
+from cosim.analysis.claims.run_evidence import ROUNDING, ClaimEnd, RunEvidence, Samples, earliest
 from noack.core.linear_systems import Propagator
 from noack.core.number_format import at_most
 from noack.core.row_operations import row_norms
@@ -57,8 +57,8 @@ class Bound(NamedTuple):
     """(k,)"""
     shares: Reals
     """Observed value over bound; for lower bounds, bound over observed value. (k,)"""
-    void: VoidFrom | None
-    """The time from which an assumption was violated."""
+    end: ClaimEnd | None
+    """The time from which nothing is claimed; that of a certificate comes in addition."""
     constant: float | None = None
     is_lower: bool = False
 
@@ -112,7 +112,7 @@ def claim(
 
 def certified(statement: str, output: str | None = None) -> Callable[[BoundFinder], ClaimDefinition]:
     """Make a function the definition of a claim of certificates."""
-    assumes = "the conditions of the certificate"
+    assumes = "the run conforms to the loop document of the certificate"
     return lambda find: ClaimDefinition(find, statement, _CERTIFICATE, assumes, output=output)
 
 
@@ -138,13 +138,13 @@ def controller_error_bound(
     formula: str,
     values: Reals,
     constant: float | None = None,
-    void: VoidFrom | None = None,
+    end: ClaimEnd | None = None,
     *,
     certificate: ScenarioCertificate | None = None,
 ) -> Bound:
     """Return a bound of ‖e_c‖_W at the measurements, by a certificate or without one.
 
-    It is void from a record's first gap. A certificate's bound is one of the x_c with which the acting input
+    It ends at a record's first gap. A certificate's bound is one of the x_c with which the acting input
     was computed.
     """
     here = samples.is_bounded
@@ -153,14 +153,14 @@ def controller_error_bound(
     # Allow for the rounding of x, which matters for a bound of that size.
     slack = run.rounding(samples.aligned.x_norm[here])
     shares = upper_shares(samples.aligned.e_c_norm[here], values[here] + slack)
-    return Bound(formula, samples.t_s[here], shares, earliest([void, run.first_gap]), constant)
+    return Bound(formula, samples.t_s[here], shares, earliest([end, run.first_gap]), constant)
 
 
 def least_inter_event_time(
     run: RunEvidence,
     samples: Samples,
     least_s: float,
-    void: VoidFrom | None,
+    end: ClaimEnd | None,
     label: str,
     certificate: ScenarioCertificate | None = None,
 ) -> ClaimBound:
@@ -174,8 +174,8 @@ def least_inter_event_time(
     if certificate is not None:
         apart_s, kind = certificate.apart_s(t_s - passed_s, run.started_s), "certified"
     formula = "t_(i+1) − t_i ≥ {} s"
-    void = earliest([void, run.lost_in_rounding])
-    bound = Bound(formula, t_s, apart_s / passed_s, void, least_s, is_lower=True)
+    end = earliest([end, run.lost_in_rounding])
+    bound = Bound(formula, t_s, apart_s / passed_s, end, least_s, is_lower=True)
     ends_s = np.array([0.0, run.record.scenario.horizon_s])
     return ClaimBound(bound, Envelope(label, "inter_event", ends_s, np.full(2, least_s), kind))
 
@@ -198,7 +198,7 @@ def i1_controller_error(run: RunEvidence, samples: Samples, _: None) -> ClaimBou
     jump = norm_text(run, "e^(H(t−t_k)) e_s(t_k)")
     formula = f"{norm_text(run, error)} ≤ {norm_text(run, 'e_s')} + Σ {jump}"
     return ClaimBound(
-        controller_error_bound(run, samples, formula, values, void=run.models_apart),
+        controller_error_bound(run, samples, formula, values, end=run.models_apart),
         Envelope("bound from (I1)", "e_c", samples.t_s, values, "identity"),
     )
 
@@ -212,8 +212,8 @@ def i1_model_difference(run: RunEvidence, samples: Samples, _: None) -> ClaimBou
     scale = max(run.facts.largest_state, _SMALLEST_NORMAL)
     formula = "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), relative residual ≤ {}"
     shares = residual / (margin * scale)
-    void = earliest([run.models_apart, run.first_gap])
-    return ClaimBound(Bound(formula, samples.t_s[here], shares, void, margin))
+    end = earliest([run.models_apart, run.first_gap])
+    return ClaimBound(Bound(formula, samples.t_s[here], shares, end, margin))
 
 
 def _margin(run: RunEvidence) -> float:
@@ -257,8 +257,8 @@ def theorem_1_controller_error(run: RunEvidence, samples: Samples, _: None) -> C
     if not is_covered or scenario.decaying.floor > 0 or (delta := run.trajectory_delta) is None:
         return ClaimBound()
     level = scenario.decaying.beta * np.exp(-scenario.decaying.alpha_per_s * samples.t_s)
-    formula, void = f"{norm_text(run, 'e_c')} ≤ {{}} βe^(−αt)", run.paper_violation
-    return ClaimBound(controller_error_bound(run, samples, formula, delta * level, delta, void))
+    formula, end = f"{norm_text(run, 'e_c')} ≤ {{}} βe^(−αt)", run.paper_end
+    return ClaimBound(controller_error_bound(run, samples, formula, delta * level, delta, end))
 
 
 @claim("minimum inter-event time", "Theorem 2, eq:tau", _IDEAL, needs_ideal_loop=True)
@@ -270,7 +270,7 @@ def theorem_2_inter_event_time(run: RunEvidence, samples: Samples, _: None) -> C
         run,
         samples,
         run.theorem_2.inter_event_s,
-        run.paper_violation,
+        run.paper_end,
         "Theorem 2 (eq:tau)",
     )
     knows_state = run.record.scenario.coverage.knows_state
@@ -289,7 +289,7 @@ def theorem_2_state(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     slack = ROUNDING * run.offset
     shares = upper_shares(row_norms(samples.plant.x), values + slack)
     formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
-    return ClaimBound(Bound(formula, samples.step_s, shares, run.paper_violation), envelope)
+    return ClaimBound(Bound(formula, samples.step_s, shares, run.paper_end), envelope)
 
 
 # What a certificate claims.
@@ -301,10 +301,10 @@ def controller_error(run: RunEvidence, samples: Samples, certificate: ScenarioCe
     if not certificate.has("e_c"):
         return ClaimBound()
     formula = certificate.pattern(norm_text(run, "e_c"), "e_c")
-    values, void = certificate.controller_error(samples.t_s), run.violation_of(certificate)
+    values = certificate.controller_error(samples.t_s)
     return ClaimBound(
         controller_error_bound(
-            run, samples, formula, values, certificate.first("e_c"), void, certificate=certificate
+            run, samples, formula, values, certificate.first("e_c"), certificate=certificate
         ),
         Envelope(f"certified for {certificate.scope}", "e_c", samples.t_s, values),
     )
@@ -317,12 +317,12 @@ def estimation_error(run: RunEvidence, samples: Samples, certificate: ScenarioCe
     if not certificate.has("estimate"):
         return ClaimBound()
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
-    here, void = samples.with_x, run.violation_of(certificate)
+    here = samples.with_x
     t_s = samples.t_s[here]
     errors = row_norms((samples.aligned.x - samples.true_x).compress(here, axis=0) @ weight.T)
     formula = certificate.pattern(norm_text(run, "x̂ − x"), "estimate")
     shares = upper_shares(errors, certificate.bound(t_s, "estimate"))
-    return ClaimBound(Bound(formula, t_s, shares, void, certificate.first("estimate")))
+    return ClaimBound(Bound(formula, t_s, shares, None, certificate.first("estimate")))
 
 
 @certified("minimum inter-event time")
@@ -330,8 +330,8 @@ def inter_event_time(run: RunEvidence, samples: Samples, certificate: ScenarioCe
     """The time between two events."""
     if certificate.inter_event_s is None:
         return ClaimBound()
-    void, label = run.violation_of(certificate), f"certified for {certificate.scope}"
-    return least_inter_event_time(run, samples, certificate.inter_event_s, void, label, certificate)
+    label = f"certified for {certificate.scope}"
+    return least_inter_event_time(run, samples, certificate.inter_event_s, None, label, certificate)
 
 
 @certified("the sensor's error is bounded")
@@ -342,8 +342,7 @@ def sensor_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertif
     formula = certificate.pattern(norm_text(run, "e_s"), "e_s")
     slack = run.rounding(samples.aligned.x_norm)
     shares = upper_shares(samples.aligned.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
-    void = run.violation_of(certificate)
-    return ClaimBound(Bound(formula, samples.t_s, shares, void, certificate.first("e_s")))
+    return ClaimBound(Bound(formula, samples.t_s, shares, None, certificate.first("e_s")))
 
 
 @certified("the state is bounded")
@@ -354,9 +353,8 @@ def state(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) 
     formula = certificate.pattern("‖x − x_r‖" if run.offset else "‖x‖", "x")
     values, slack = certificate.state(samples.step_s), ROUNDING * run.offset
     shares = upper_shares(row_norms(samples.plant.x), values + slack)
-    void = run.violation_of(certificate)
     return ClaimBound(
-        Bound(formula, samples.step_s, shares, void, certificate.first("x")),
+        Bound(formula, samples.step_s, shares, None, certificate.first("x")),
         Envelope(f"certified for {certificate.scope}", "x", samples.step_s, values),
     )
 
@@ -389,16 +387,15 @@ def _output_claim(
     def output_claim(run: RunEvidence, samples: Samples, of_loop: ScenarioCertificate) -> ClaimBound:
         observed = np.abs(samples.plant.x @ np.array(output.row))
         slack, t_s = ROUNDING * run.offset, samples.step_s
-        void = run.violation_of(of_loop)
         if settles_s is not None and output.allowed is not None:
             later = t_s >= settles_s
             shares = observed[later] / (output.allowed + slack)
             limit = f"{escaped(output_bound.symbol)} ≤ {{}} {escaped(output.unit)}".rstrip()
             formula = f"{limit} from {at_most(settles_s, 3)} s on"
-            return ClaimBound(Bound(formula, t_s[later], shares, void, output.allowed))
+            return ClaimBound(Bound(formula, t_s[later], shares, None, output.allowed))
         values, first = certificate.state(t_s), certificate.first("x")
         return ClaimBound(
-            Bound(output_bound.pattern, t_s, upper_shares(observed, values + slack), void, first),
+            Bound(output_bound.pattern, t_s, upper_shares(observed, values + slack), None, first),
             Envelope(f"certified for {of_loop.scope}", output.distance, t_s, values),
         )
 
@@ -416,7 +413,7 @@ def region(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate)
     formulas = {i: proven.formula(f"|{names[i]}|", f"x[{i}]") for i in entries}
     formula = ", ".join(formulas[i].format(at_most(entries[i].first)) for i in entries)
     shares = np.max([x[:, i] / limit for i, limit in limits.items()], axis=0)
-    return ClaimBound(Bound(formula, samples.step_s, shares, run.violation_of(certificate)))
+    return ClaimBound(Bound(formula, samples.step_s, shares, None))
 
 
 CERTIFIED_AND_IDENTITY = (

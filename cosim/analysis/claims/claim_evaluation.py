@@ -1,7 +1,8 @@
 """Checks every claim about a run against its record, after the run, in one pass.
 
-What a certificate claims ends at the first change of a setting on which the certificate depends. The
-identity (I1) holds across changes, and is checked to the end of the run.
+What a certificate claims ends where the run does not conform to the certificate's loop document, and at the
+first change of a setting on which the certificate depends. The identity (I1) holds across changes, and is
+checked to the end of the run.
 
 Certificates bound deviations from the reference; (I1) needs no such coordinates. The processes of a
 stopped run end some milliseconds apart: claims are checked up to the last time that all of them
@@ -23,11 +24,12 @@ from cosim.analysis.claims.claim_catalogue import (
     claims_about,
     output_claims,
 )
-from cosim.analysis.claims.common_end import common_end_ns, up_to_common_end
-from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.reference_deviations import deviations
-from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
-from cosim.analysis.summary.summary_model import NO_BOUND, Claim, ClaimVerdict, ViolationPart
+from cosim.analysis.claims.run_certificates import RunCertificate
+from cosim.analysis.claims.run_evidence import ROUNDING, ClaimEnd, RunEvidence, Samples, earliest
+from cosim.analysis.conformance.common_end import common_end_ns, up_to_common_end
+from cosim.analysis.conformance.trace import MOST_ITEMS
+from cosim.analysis.summary.summary_model import NO_BOUND, Claim, ClaimCause, ClaimVerdict, ConformancePart
 from cosim.record.decimation import decimate
 from cosim.record.divergence import largest_reference
 from cosim.record.run_events import changes_of
@@ -37,21 +39,14 @@ from noack.core.number_format import at_least, at_most
 from noack.core.references import Reference
 from noack.scenario.loads import first_load_change_s
 from noack.scenario.resolution import loop_of
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import BOX, NetworkConditions, jump_s, outside_box
-
-_IDEAL_LOOP = "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"
-_ACKNOWLEDGED = (
-    'network.protocol = "ack": x_s is reset when an update is acknowledged, and not at every '
-    "event as (I1), and every claim that follows from it, assumes"
-)
+from noack.theory.certificates.conditions import NetworkConditions, jump_s
 
 
-def void_claim(claimed: str, source: str, why: str) -> Claim:
-    """Return a claim that cannot be checked because there is no bound."""
+def unchecked(claimed: str, source: str, cause: ClaimCause, detail: str = "") -> Claim:
+    """Return a claim of which nothing was compared."""
     return Claim(
         what=claimed, source=source, bound=NO_BOUND, certified=None, observed=None, ratio=None,
-        verdict=ClaimVerdict.VOID, since_s=0.0, why=why, until_s=None,
+        verdict=ClaimVerdict.UNCHECKED, since_s=0.0, cause=cause, detail=detail, until_s=None,
     )  # fmt: skip
 
 
@@ -62,7 +57,7 @@ class ClaimCheck:
         claimed: what is claimed.
         source: of the claim.
         until_s: end of the claim.
-        unmet: an assumption that the run cannot meet.
+        end: from when on nothing is claimed, besides what the bound says.
     """
 
     def __init__(
@@ -70,17 +65,17 @@ class ClaimCheck:
         claimed: ClaimDefinition,
         source: str,
         until_s: float,
-        unmet: str = "",
+        end: ClaimEnd | None = None,
     ) -> None:
-        self._claimed, self._source, self.until_s, self._unmet = claimed, source, until_s, unmet
+        self._claimed, self._source, self.until_s, self._end_of_all = claimed, source, until_s, end
         self._ratio: float | None = None
         self._exceeded_s: float | None = None
         self._bound: Bound | None = None
 
     @property
     def is_claimed(self) -> bool:
-        """Whether there is a claim about the run: a value was compared, or an assumption violated."""
-        return self._bound is not None and (self._ratio is not None or self._void is not None)
+        """Whether there is a claim about the run: a value was compared, or the claim ended."""
+        return self._bound is not None and (self._ratio is not None or self._end is not None)
 
     def add(self, bound: Bound) -> None:
         """Add the bound at the next samples; formula and constants are the same in every part."""
@@ -96,28 +91,27 @@ class ClaimCheck:
             self._exceeded_s = float(t_s[exceeded[0]])
 
     @property
-    def _void(self) -> VoidFrom | None:
-        """The violated assumption that ends the claim early."""
+    def _end(self) -> ClaimEnd | None:
+        """What ends the claim early."""
         assert self._bound is not None
-        void = self._bound.void
-        return void if void is not None and void.t_s < self.until_s else None
+        end = earliest([self._bound.end, self._end_of_all])
+        return end if end is not None and end.t_s < self.until_s else None
 
     @property
     def _end_s(self) -> float:
-        return self.until_s if (void := self._void) is None else void.t_s
+        return self.until_s if (end := self._end) is None else end.t_s
 
     def result(self) -> Claim:
         """Return the claim with its verdict, after the last samples."""
-        bound, void, why, ratio = self._bound, self._void, self._unmet, self._ratio
+        bound, end, ratio, since_s = self._bound, self._end, self._ratio, self._exceeded_s
         assert bound is not None
-        since_s = self._exceeded_s
+        verdict, cause, detail = ClaimVerdict.HELD, None, ""
         if since_s is not None:
-            verdict = ClaimVerdict.NOT_APPLICABLE if self._unmet else ClaimVerdict.VIOLATED
-        elif void is not None:
-            verdict, since_s = ClaimVerdict.VOID, void.t_s
-            why = "; ".join(filter(None, [self._unmet, void.why]))
-        else:
-            verdict = ClaimVerdict.HELD
+            verdict = ClaimVerdict.VIOLATED
+            if self._claimed.needs_ideal_loop:
+                verdict, cause = ClaimVerdict.NOT_APPLICABLE, ClaimCause.IDEAL_LOOP
+        elif end is not None:
+            verdict, since_s, cause, detail = ClaimVerdict.ENDED, end.t_s, end.cause, end.detail
         observed, constant = None, bound.constant
         if constant is not None and ratio is not None:
             observed = constant * ratio
@@ -127,7 +121,7 @@ class ClaimCheck:
         return Claim(
             what=self._claimed.statement, source=self._source, bound=bound.formula.format(text),
             certified=constant, observed=observed, ratio=ratio, verdict=verdict,
-            since_s=since_s, why=why,
+            since_s=since_s, cause=cause, detail=detail,
             until_s=round(self.until_s, 9) if math.isfinite(self.until_s) else None,
             proved=self._claimed.is_certified or None,
             output=self._claimed.output,
@@ -143,17 +137,14 @@ class _ClaimInstance(NamedTuple):
     check: ClaimCheck
     curve: list[Envelope]
     """Its curve, from samples to samples."""
-    certificate: ScenarioCertificate | None = None
-    outside: str | None = None
-    """Why the certificate does not cover the run's plant."""
+    certificate: RunCertificate | None = None
 
     def take(self, samples: Samples) -> None:
         """Check the next samples, and add to the curve, which is thinned if the run is long."""
         evidence = self.evidence
-        bound, envelope = self.claimed.find(evidence, samples, self.certificate)
+        certificate = None if self.certificate is None else self.certificate.certificate
+        bound, envelope = self.claimed.find(evidence, samples, certificate)
         if evidence.facts.shares_an_update and bound is not None:
-            if self.outside is not None:
-                bound = bound._replace(void=VoidFrom(0.0, self.outside))
             self.check.add(bound)
         if envelope is None or (envelope.quantity == "inter_event" and self.curve):
             return  # the same line for all samples
@@ -168,11 +159,12 @@ class RunClaims:
     """The claims about a run; each property is computed once."""
 
     record: RunRecord
-    certificates: Sequence[ScenarioCertificate] | None = None
-    """Those of the run's scenario, if they are known. They are not those of a run with a reference, which
-    are about it: these are computed here, with the witnesses that were found for the others."""
+    certificates: Sequence[RunCertificate] | None = None
+    """Those of the run's scenario, if they are known."""
     most_work: float = 0.0
     """Limit of the search for a witness; 0: only those are used that are known."""
+    most_items: int = MOST_ITEMS
+    """So many steps are compared with a loop document in all numbers."""
 
     @cached_property
     def _checked_record(self) -> RunRecord:
@@ -204,12 +196,12 @@ class RunClaims:
         if (reference := self._reference) is None:
             return self.evidence
         moved = deviations(self._checked_record, reference)
-        return self._evidence(moved, None, largest_reference(reference, self.record.scenario))
+        return self._evidence(moved, self.certificates, largest_reference(reference, self.record.scenario))
 
     def _evidence(
         self,
         record: RunRecord,
-        certificates: Sequence[ScenarioCertificate] | None = None,
+        certificates: Sequence[RunCertificate] | None = None,
         offset: float = 0.0,
     ) -> RunEvidence:
         changes = [change.first_ns for change in changes_of(self._checked_record) if change.touches_claims]
@@ -217,7 +209,9 @@ class RunClaims:
         if record is not self._checked_record and (at_s := jump_s(self.record.scenario)) is not None:
             until_s = min(until_s, at_s)
         until_s = min(until_s, first_load_change_s(self.record.scenario))
-        return RunEvidence(record, self.record, until_s, certificates, offset, self.most_work)
+        return RunEvidence(
+            record, self.record, until_s, certificates, offset, self.most_work, self.most_items
+        )
 
     @property
     def _is_evaluated(self) -> bool:
@@ -239,30 +233,53 @@ class RunClaims:
         """The conditions of the certificates of the run's lateness, if they are used."""
         return self.certified_evidence.certified_for
 
-    def violations(self) -> list[AssumptionViolation]:
-        """The assumptions that the run violated, each at the first time."""
-        return sorted(self.certified_evidence.violations(), key=lambda violation: violation.t_s)
-
     def evaluate(self) -> list[Claim]:
         """Return every claim with its verdict."""
         if not self.evidence.facts.shares_an_update:
             return []
         if self.record.scenario.protocol.acknowledges:
-            return [void_claim("x_c − x_s is the sum of the missed jumps", "(I1)", _ACKNOWLEDGED)]
-        claims: list[Claim] = []
-        for certificate in (None, *self.certified_evidence.certificates):
-            if certificate is not None and not certificate.exists:
-                claimed = f"a certificate for {certificate.scope}"
-                claims.append(void_claim(claimed, certificate.source, certificate.void or ""))
-            own = [instance.check for instance in self._checked if instance.certificate is certificate]
-            claimed_checks = [check for check in own if check.is_claimed]
-            if certificate is not None and own and not claimed_checks:
-                why = (
-                    f"settings changed at {self.certified_evidence.until_s:.3f} s, before it could be checked"
-                )
-                claims.append(void_claim(f"a certificate for {certificate.scope}", certificate.source, why))
-            claims += [check.result() for check in claimed_checks]
+            what = "x_c − x_s is the sum of the missed jumps"
+            return [unchecked(what, "(I1)", ClaimCause.ACKNOWLEDGED)]
+        claims = [each.check.result() for each in self._claimed(None)]
+        for certificate in self.certified_evidence.certificates:
+            claimed = self._claimed(certificate)
+            if (cause := self._cause(certificate, has_claims=bool(claimed))) is not None:
+                what = f"a certificate for {certificate.certificate.scope}"
+                claims.append(unchecked(what, certificate.certificate.source, *cause))
+            claims += [each.check.result() for each in claimed]
         return claims
+
+    def _claimed(self, certificate: RunCertificate | None) -> list["_ClaimInstance"]:
+        """Return the claims of a certificate, or those that need none, about which the run says something."""
+        own = [each for each in self._checked if each.certificate is certificate]
+        return [each for each in own if each.check.is_claimed]
+
+    def _cause(self, certificate: RunCertificate, *, has_claims: bool) -> tuple[ClaimCause, str] | None:
+        """Return why nothing of a certificate was compared; None: something was."""
+        if not certificate.certificate.exists:
+            return ClaimCause.NO_CERTIFICATE, certificate.certificate.void or ""
+        end = self.certified_evidence.end_of(certificate)
+        if end is not None and end.cause is ClaimCause.NO_DOCUMENT:
+            return end.cause, end.detail
+        if has_claims:
+            return None
+        return ClaimCause.CHANGED, f"{self.certified_evidence.until_s:.3f}"
+
+    def conformance(self) -> list[ConformancePart]:
+        """Return for each certificate whether the run is one of its loop document."""
+        if not self.evidence.facts.shares_an_update or self.record.scenario.protocol.acknowledges:
+            return []
+        evidence, parts = self.certified_evidence, list[ConformancePart]()
+        for certificate in evidence.certificates:
+            if not certificate.certificate.exists:
+                continue
+            source, end = certificate.certificate.source, evidence.end_of(certificate)
+            if certificate.document is None or (end and end.cause is ClaimCause.NO_DOCUMENT):
+                missing = certificate.missing if end is None else end.detail
+                parts.append(ConformancePart(certificate=source, document="", missing=missing))
+            else:
+                parts.append(ConformancePart.of(evidence.conformance_of(certificate.document), source))
+        return parts
 
     @cached_property
     def _checked(self) -> list[_ClaimInstance]:
@@ -279,20 +296,21 @@ class RunClaims:
         """Yield the claims of each certificate, and those that need none."""
         certified, claims = self.certified_evidence, claims_about(self.record.scenario)
         for certificate in certified.certificates:
-            if not certificate.exists:
+            if not certificate.certificate.exists:
                 continue
-            outside = outside_box(certified.record.scenario) if certificate.scope == BOX else None
-            for claim in (*output_claims(certified, certificate), *claims):
+            end, source = certified.end_of(certificate), certificate.certificate.source
+            if end is not None and end.cause is ClaimCause.NO_DOCUMENT:
+                continue
+            for claim in (*output_claims(certified, certificate.certificate), *claims):
                 if claim.is_certified:
-                    check = ClaimCheck(claim, certificate.source, certified.until_s)
-                    yield _ClaimInstance(claim, certified, check, [], certificate, outside)
+                    check = ClaimCheck(claim, source, certified.until_s, end)
+                    yield _ClaimInstance(claim, certified, check, [], certificate)
         for claim in claims:
             if not claim.is_certified:
-                unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
                 evidence, until_s = (
                     (self.evidence, math.inf) if claim.to_the_end else (certified, certified.until_s)
                 )
-                check = ClaimCheck(claim, claim.source, until_s, unmet)
+                check = ClaimCheck(claim, claim.source, until_s)
                 yield _ClaimInstance(claim, evidence, check, [])
 
     def envelopes(self) -> list[Envelope]:
@@ -312,27 +330,6 @@ class RunClaims:
                 whole = curve[0]._replace(t_s=t_s, values=values)
                 envelopes.append(_envelope_until(whole, instance.check.until_s))
         return envelopes
-
-
-def list_violations(
-    reported: Sequence[ViolationPart], observed: Sequence[AssumptionViolation]
-) -> list[ViolationPart]:
-    """Return all violations of a run: those reported by processes, then those found in the record.
-
-    A violation of M − 1 that a process reported is not repeated.
-    """
-    known = {violation.cause for violation in reported}
-    return [*reported] + [
-        ViolationPart(
-            t_s=violation.t_s,
-            process="recorder",
-            cause=violation.cause,
-            what=violation.text,
-            worst_at_s=violation.worst_at_s,
-        )
-        for violation in observed
-        if violation.cause not in known
-    ]
 
 
 @lru_cache(maxsize=1)

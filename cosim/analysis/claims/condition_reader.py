@@ -7,13 +7,8 @@ from collections import deque
 
 import numpy as np
 
-from cosim.analysis.claims.input_origins import AppliedUpdate, Times, plant_inputs
-from cosim.analysis.claims.observed_conditions import (
-    ObservedConditions,
-    PacketLosses,
-    SampledSeries,
-    clock_cause,
-)
+from cosim.analysis.claims.observed_conditions import ObservedConditions, PacketLosses
+from cosim.analysis.conformance.input_origins import AppliedUpdate, SampledSeries, Times, plant_inputs
 from cosim.record.rows import messages_in
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
@@ -56,10 +51,9 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
         start_s=inputs.start_s,
         watchdog=inputs.watchdog,
         safe_input=inputs.safe_input,
-        timeout_s=scenario.timing.actuation_timeout_ns / NS_PER_S,
         early_messages=_early_messages(record) if clocks else {},
         allowed_leads_s={
-            clock_cause(role): allowed_lead_ns(role, clocks) * scenario.speed / NS_PER_S
+            role: allowed_lead_ns(role, clocks) * scenario.speed / NS_PER_S
             for role in (RECEIVED if clocks else ())
         },
         clock_error_s=max((clock.error_ns / NS_PER_S for clock in clocks.values()), default=None),
@@ -79,13 +73,13 @@ def _gaps(t_ns: Times, end_ns: int) -> SampledSeries:
 
 
 def _early_messages(record: RunRecord) -> dict[str, SampledSeries]:
-    """Return by how much messages were received before they were sent, by the name of the assumption."""
+    """Return by how much messages were received before they were sent, by receiving process."""
     series: dict[str, SampledSeries] = {}
     for role, (table, _) in RECEIVED.items():
         rows = record.columns(table, "t_ns", "now_ns")
         early = rows["t_ns"] > rows["now_ns"]
         t_ns, now_ns = rows["t_ns"][early], rows["now_ns"][early]
-        series[clock_cause(role)] = SampledSeries(np.maximum(now_ns, 0) * 1e-9, (t_ns - now_ns) * 1e-9)
+        series[role] = SampledSeries(np.maximum(now_ns, 0) * 1e-9, (t_ns - now_ns) * 1e-9)
     return series
 
 

@@ -1,18 +1,19 @@
 """The certificates of a run: under its scenario's schedule, or under the times that occurred."""
 
-from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
 from flint import fmpq
 
+from cosim.analysis.conformance.run_document import RunDocument, document_of_statement
+from cosim.analysis.loop_files import naming_of
 from cosim.analysis.scenario_certificates import certificate_of
-from cosim.analysis.witnesses import find_statement, plants_of
+from cosim.analysis.witnesses import WitnessedStatement, find_statement, plants_of
 from noack.core.clock import NS_PER_S
+from noack.proof.loop_document import NoDocumentError
 from noack.scenario.loads import with_constant_load
 from noack.scenario.scenario import Scenario
 from noack.settings.section import Table
-from noack.theory.certificates.assumptions import Assumption, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import NetworkConditions, allowed_conditions, certified_delay_s
 
@@ -21,12 +22,14 @@ RUN_WORK = 2.5
 """Limit of the search for a witness of a run, some 10 s: :class:`noack.theory.witnesses.effort.Effort`."""
 
 
-class Expectations(NamedTuple):
-    """What follows from the scenario of a loop alone."""
+class RunCertificate(NamedTuple):
+    """A certificate, and the loop document with which a run is compared."""
 
-    assumptions: Sequence[Assumption]
-    certificates: Sequence[ScenarioCertificate] | None
-    """None if they cannot be computed, which the claims then report."""
+    certificate: ScenarioCertificate
+    document: RunDocument | None
+    """None: there is no certificate, or no document describes the loop."""
+    missing: str = ""
+    """Why no document describes it."""
 
 
 def search_limit(loops: int) -> float:
@@ -34,20 +37,19 @@ def search_limit(loops: int) -> float:
     return RUN_WORK / loops if loops <= _FEW_LOOPS else 0.0
 
 
-def expectations(scenario: Scenario, loops: int) -> Expectations:
-    """Return what to expect of a loop of a run with a number of loops."""
-    certificates = None
+def expected_certificates(scenario: Scenario, loops: int) -> list[RunCertificate] | None:
+    """Return the certificates of a loop of a run with a number of loops; None if that fails."""
     with suppress(Exception):
-        certificates = scheduled_certificates(scenario, search_limit(loops))
-    return Expectations(assumptions(scenario), certificates)
+        return scheduled_certificates(scenario, search_limit(loops))
+    return None
 
 
-def expectations_key(scenario: Scenario) -> str:
-    """Return what the expectations of loops depend on: equal loops share them."""
+def certificates_key(scenario: Scenario) -> str:
+    """Return what the certificates of loops depend on: equal loops share them."""
     return scenario.model_dump_json(exclude={"name", "seeds"})
 
 
-def scheduled_certificates(scenario: Scenario, most_work: float = 0.0) -> list[ScenarioCertificate]:
+def scheduled_certificates(scenario: Scenario, most_work: float = 0.0) -> list[RunCertificate]:
     """Return the certificates of a resolved scenario under its schedule, void ones with the reason.
 
     ``most_work``: limit of the search for a witness; 0: one that is known, or by gains.
@@ -57,7 +59,7 @@ def scheduled_certificates(scenario: Scenario, most_work: float = 0.0) -> list[S
 
 def certificates_under(
     conditions: NetworkConditions, scenario: Scenario, most_work: float = 0.0
-) -> list[ScenarioCertificate]:
+) -> list[RunCertificate]:
     """Return the certificates of a resolved scenario, where its times are at least those of some conditions.
 
     They hold until a setting on which they depend, or a load, first changes, and until the plant first
@@ -73,14 +75,23 @@ def certificates_under(
         "start": conditions.start_s,
     }
     longer = {name: fmpq(round(t_s * NS_PER_S), NS_PER_S) for name, t_s in times_s.items()}
-    return [
-        certificate_of(
-            scenario,
-            find_statement(scenario, plants, "schedule", most_work=most_work, longer=longer),
-            conditions,
-        )
+    statements = (
+        find_statement(scenario, plants, "schedule", most_work=most_work, longer=longer)
         for plants in plants_of(scenario)
-    ]
+    )
+    return [_with_document(scenario, statement, conditions) for statement in statements]
+
+
+def _with_document(
+    scenario: Scenario, statement: WitnessedStatement, conditions: NetworkConditions
+) -> RunCertificate:
+    certificate = certificate_of(scenario, statement, conditions)
+    if not certificate.exists:
+        return RunCertificate(certificate, None)
+    try:
+        return RunCertificate(certificate, document_of_statement(statement, naming_of(scenario, statement)))
+    except NoDocumentError as error:
+        return RunCertificate(certificate, None, str(error))
 
 
 def _checked_by_run(scenario: Scenario) -> Scenario:

@@ -1,50 +1,63 @@
 """The data that claims are checked against: signals, observed conditions, certificates."""
 
 import math
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.certificates import theorem_2_of
-from cosim.analysis.claims.common_end import common_end_ns
 from cosim.analysis.claims.condition_reader import read_conditions
-from cosim.analysis.claims.observed_conditions import (
-    CLOCK_CAUSES,
-    AssumptionViolation,
-    ObservedConditions,
-    Reals,
-    VoidFrom,
-    causes_of,
-    earliest,
-    guarantee_causes,
-)
-from cosim.analysis.claims.run_certificates import certificates_under, scheduled_certificates
+from cosim.analysis.claims.observed_conditions import ObservedConditions, Reals
+from cosim.analysis.claims.run_certificates import RunCertificate, certificates_under, scheduled_certificates
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
+from cosim.analysis.conformance.common_end import common_end_ns
+from cosim.analysis.conformance.run_conformance import conformance
+from cosim.analysis.conformance.run_document import RunDocument
+from cosim.analysis.conformance.trace import MOST_ITEMS
+from cosim.analysis.conformance.verdicts import Conformance
 from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.analysis.summary.signal_statistics import SampleFacts, signal_statistics
+from cosim.analysis.summary.summary_model import ClaimCause
 from cosim.record.align import AlignedRun, PlantStates, aligned_parts, bounded_parts
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NEVER_NS
+from noack.core.errors import CallerError
 from noack.core.row_operations import all_entries
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.runtime_parameters import SETPOINT
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import NetworkConditions, allowed_conditions, nominal_conditions
+from noack.theory.certificates.conditions import (
+    BOX,
+    NetworkConditions,
+    allowed_conditions,
+    nominal_conditions,
+    outside_box,
+)
 from noack.theory.coverage import is_linear_loop
 from noack.theory.paper import Theorem2
 
 ROUNDING = 1e-9
 """Relative rounding error of an exact computation over a run of 10,000 steps."""
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
-_ANY = NetworkConditions(
-    sys.maxsize, sampling_s=_LONG_S, delay_s=_LONG_S, hold_s=_LONG_S, start_s=_LONG_S, lead_s=_LONG_S
-)
+
+
+class ClaimEnd(NamedTuple):
+    """The time from which nothing is claimed, and why."""
+
+    t_s: float
+    cause: ClaimCause
+    detail: str = ""
+    """The process, the rule or the reason that the cause is about."""
+
+
+def earliest(candidates: Iterable[ClaimEnd | None]) -> ClaimEnd | None:
+    """The first of several; None if there is none."""
+    return min(filter(None, candidates), default=None)
 
 
 @dataclass(frozen=True)
@@ -98,14 +111,16 @@ class RunEvidence:
     """That of the whole run, if it is another one."""
     until_s: float = math.inf
     """End of what certificates claim: the first change of a setting on which they depend."""
-    scheduled: Sequence[ScenarioCertificate] | None = None
+    scheduled: Sequence[RunCertificate] | None = None
     """The certificates under the scenario's schedule, if they are known."""
     offset: float = 0.0
     """‖x_r‖ of the set-point: x in deviations has the rounding errors of x."""
     most_work: float = 0.0
     """Limit of the search for a witness; 0: only those are used that are known."""
-    _violations: dict[int, VoidFrom | None] = field(default_factory=dict, init=False)
-    """First violations that are known already, by the ``id`` of the certificate."""
+    most_items: int = MOST_ITEMS
+    """So many steps are compared with a loop document in all numbers."""
+    _conformances: dict[int, Conformance] = field(default_factory=dict, init=False)
+    """Those that are known already, by the ``id`` of the document."""
 
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
@@ -119,15 +134,14 @@ class RunEvidence:
             yield Samples(aligned, bounded, both, residual, true_x, part.plant, passed)
 
     @cached_property
-    def lost_in_rounding(self) -> VoidFrom | None:
+    def lost_in_rounding(self) -> ClaimEnd | None:
         """When the threshold falls below the rounding of x at a set-point: events are chance."""
         for part in aligned_parts(self.record) if self.offset else ():
             aligned = part.aligned
             compared = aligned.threshold > 0  # a periodic trigger compares nothing
             below = np.flatnonzero(compared & (aligned.threshold < self.rounding(aligned.x_norm)))
             if len(below):
-                why = "the threshold is below the rounding error of x at the set-point"
-                return VoidFrom(float(aligned.t_ns[below[0]]) * 1e-9, why)
+                return ClaimEnd(float(aligned.t_ns[below[0]]) * 1e-9, ClaimCause.ROUNDING)
         return None
 
     def rounding(self, x_norm: Reals) -> Reals:
@@ -142,23 +156,23 @@ class RunEvidence:
     @cached_property
     def trajectory_delta(self) -> float | None:
         """Theorem 1's Δ from the trajectory, up to the first violation of its assumptions."""
-        void = self.paper_violation
-        until_s = self.until_s if void is None else min(self.until_s, void.t_s)
+        end = self.paper_end
+        until_s = self.until_s if end is None else min(self.until_s, end.t_s)
         return trajectory_delta(self.record, until_s)
 
     @cached_property
-    def _scheduled(self) -> Sequence[ScenarioCertificate]:
+    def _scheduled(self) -> Sequence[RunCertificate]:
         """The certificates under the scenario's schedule."""
         if self.scheduled is not None:
             return self.scheduled
         return scheduled_certificates((self.whole_record or self.record).scenario, self.most_work)
 
     @cached_property
-    def late(self) -> Sequence[ScenarioCertificate] | None:
+    def late(self) -> Sequence[RunCertificate] | None:
         """The certificates for the times that occurred, of a run that was later than allowed.
 
-        A certificate holds for every run that meets its conditions, whenever they were chosen. None:
-        the run was not late, rows that are missing may be later, or there is no such certificate.
+        Their documents say so. None: the run was not late, rows that are missing may be later, or there is no
+        such certificate.
         """
         whole_record, widest = (
             self.whole_record or self.record,
@@ -166,23 +180,48 @@ class RunEvidence:
         )
         if widest == self.allowed or not all(map(whole_record.is_complete, LOOP_ROLES)):
             return None
-        if not any(certificate.exists for certificate in self._scheduled):
+        if not any(each.certificate.exists for each in self._scheduled):
             return None
         certificates = certificates_under(widest, whole_record.scenario, self.most_work)
-        return certificates if any(certificate.exists for certificate in certificates) else None
+        return certificates if any(each.certificate.exists for each in certificates) else None
 
     @cached_property
-    def certificates(self) -> list[ScenarioCertificate]:
+    def certificates(self) -> list[RunCertificate]:
         """The certificates of the run: those of its scenario, or of its lateness, where there are some."""
         pairs = zip(self._scheduled, self.late or self._scheduled, strict=True)
-        return [late if late.exists else scheduled for scheduled, late in pairs]
+        return [late if late.certificate.exists else scheduled for scheduled, late in pairs]
 
     @property
     def certified_for(self) -> NetworkConditions | None:
         """The conditions of the certificates of the run's lateness, if one of them is used."""
-        used = [certificate.conditions for certificate in self.certificates if certificate.exists]
-        late = [certificate.conditions for certificate in self.late or () if certificate.conditions in used]
-        return late[0] if late else None
+        used = [each.certificate for each in self.certificates if each.certificate.exists]
+        late = [each.certificate for each in self.late or ()]
+        return next((each.conditions for each in late if any(each is one for one in used)), None)
+
+    def conformance_of(self, document: RunDocument) -> Conformance:
+        """Return whether the run is one of a loop document, up to the end of what certificates claim.
+
+        Raises:
+            CallerError: the record cannot be compared with it.
+        """
+        known = self._conformances
+        if id(document) not in known:
+            whole_record = self.whole_record or self.record
+            known[id(document)] = conformance(whole_record, document, self.until_s, self.most_items)
+        return known[id(document)]
+
+    def end_of(self, certificate: RunCertificate) -> ClaimEnd | None:
+        """Return from when on the bounds of a certificate need not hold; None: they hold of the whole run."""
+        if certificate.document is None:
+            return ClaimEnd(0.0, ClaimCause.NO_DOCUMENT, certificate.missing)
+        if certificate.certificate.scope == BOX and (why := outside_box(self.record.scenario)) is not None:
+            return ClaimEnd(0.0, ClaimCause.OUTSIDE, why)
+        try:
+            failure = self.conformance_of(certificate.document).failure
+        except CallerError as error:
+            return ClaimEnd(0.0, ClaimCause.NO_DOCUMENT, str(error))
+        not_one = None if failure is None else ClaimEnd(failure.t_s, ClaimCause.CONFORMANCE)
+        return earliest([not_one, self.first_gap])
 
     @cached_property
     def observed(self) -> ObservedConditions:
@@ -215,63 +254,52 @@ class RunEvidence:
         is_bounded &= np.searchsorted(reset_s, t_s, "right") <= np.searchsorted(acts_s, t_s, "right")
         return np.asarray(is_bounded)
 
-    def violations(self) -> list[AssumptionViolation]:
-        """The assumptions of certificates that the run violated, each at the first time.
-
-        Whether the guarantee was kept later on, the controller reports with the limits of the time.
-        """
-        scenario = self.record.scenario
-        rules = {*guarantee_causes(scenario)}
-        violations = self.observed.violations(self.allowed, {*causes_of(scenario)} - rules)
-        # An update that a newer one replaced within the certified delay is not lost.
-        violations += self.observed.violations(self.certified_for or self.allowed, rules)
-        return [violation for violation in violations if violation.t_s < self.until_s]
-
     @cached_property
-    def first_gap(self) -> VoidFrom | None:
+    def first_gap(self) -> ClaimEnd | None:
         """The time from which no claim can be checked.
 
         The record is incomplete, or the error of a process's clock is not bounded as required.
         """
-        limit = _ANY._replace(sampling_s=self._nominal.sampling_s)
-        gaps = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
+        observed = self.observed
+        gaps: list[ClaimEnd] = []
+        if (missing := observed.sampling.excess(self._nominal.sampling_s)) is not None:
+            gaps.append(ClaimEnd(missing.first_s, ClaimCause.MISSING_MEASUREMENT))
+        for role, early in observed.early_messages.items():
+            if (excess := early.excess(observed.allowed_leads_s[role])) is not None:
+                gaps.append(ClaimEnd(excess.first_s, ClaimCause.CLOCK, role))
         whole_record = self.whole_record or self.record
         end_ns = common_end_ns(whole_record)
         end_s = math.inf if end_ns is None else end_ns * 1e-9
         for role in LOOP_ROLES:
             gap_ns = None if whole_record.is_complete(role) else whole_record.rows_of(role).gap_ns
             if gap_ns is not None and 0 <= (at_s := gap_ns * 1e-9) <= end_s:
-                gaps.append(VoidFrom(at_s, f"rows of {role} are missing from the record"))
+                gaps.append(ClaimEnd(at_s, ClaimCause.MISSING_ROWS, role))
         if (gap_s := self.facts.gap_s) is not None:
-            why = "the controller's error is not on record, or not finite"
-            gaps.append(VoidFrom(gap_s, why))
+            gaps.append(ClaimEnd(gap_s, ClaimCause.NO_ERROR))
         return earliest(gaps)
 
     @cached_property
-    def models_apart(self) -> VoidFrom | None:
+    def models_apart(self) -> ClaimEnd | None:
         """When sensor and controller first had different set-points: then (I1) does not hold."""
         for change in changes_of(self.record):
             times_ns = {change.since_ns.get(role, NEVER_NS) for role in ("sensor", "controller")}
             if SETPOINT in change.change.settings and len(times_ns) > 1:
-                why = "sensor and controller took the change of the set-point at different times"
-                return VoidFrom(min(times_ns) * 1e-9, why)
+                return ClaimEnd(min(times_ns) * 1e-9, ClaimCause.SETPOINTS)
         return None
 
     @cached_property
-    def paper_violation(self) -> VoidFrom | None:
-        """First violation of the guarantee or of u = K x_c, which the paper's theorems assume."""
-        nominal, rules = self._nominal, guarantee_causes(self.record.scenario)
-        limit = _ANY._replace(dropouts=nominal.dropouts, constraints=nominal.constraints)
-        causes = (*rules, "watchdog", "safe input")
-        return earliest([self.observed.first_violation(limit, causes), self.first_gap])
-
-    def violation_of(self, certificate: ScenarioCertificate) -> VoidFrom | None:
-        """Return the time at which the run first violated the conditions of a certificate."""
-        known, conditions = self._violations, certificate.conditions
-        if id(certificate) not in known:
-            first = min(self.observed.violations(conditions), default=None)
-            known[id(certificate)] = None if first is None else VoidFrom(first.t_s, first.text)
-        return known[id(certificate)]
+    def paper_end(self) -> ClaimEnd | None:
+        """When the guarantee or u = K x_c, which the paper's theorems assume, first did not hold."""
+        observed, ends = self.observed, [self.first_gap]
+        if (broken := observed.first_broken_rule(self._nominal._replace(delay_s=_LONG_S))) is not None:
+            ends.append(ClaimEnd(broken[0], ClaimCause.LOSSES, broken[1]))
+        for series, cause in (
+            (observed.watchdog, ClaimCause.WATCHDOG),
+            (observed.safe_input, ClaimCause.SAFE_INPUT),
+        ):
+            if len(series.t_s):
+                ends.append(ClaimEnd(float(series.t_s[0]), cause))
+        return earliest(ends)
 
     @cached_property
     def allowed(self) -> NetworkConditions:

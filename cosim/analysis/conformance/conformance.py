@@ -6,7 +6,11 @@ is a path: each item is a motion in a location, or an edge. For a run of the doc
 * the path begins at the start and has each recorded step: motions lead to the next step, edges take no time;
 * an edge is taken while the clock is in its interval, where its facts hold, and z becomes J z;
 * in a location the clock does not exceed its limit, the facts hold, and z moves as the motion says;
-* x and u are the recorded x and u. The recorded x_s and x_c are not compared.
+* u is the recorded one, and what the document's readings say of z is what was recorded: x at all steps, and
+  x_s and x_c where the record has them.
+
+Edges, clocks and times are compared at all items. Motions, facts, jumps and readings are compared at those of
+which the trace has z, before and after: the result says which share that is.
 
 Between two steps of the plant the input is constant. A motion whose corners have a common part,
 Fᵢ = F + B Uᵢ, moves as ż = F z + B u + Σ c p with u = Σ λᵢ Uᵢ z. So z at the end follows from z and u, but
@@ -14,93 +18,53 @@ for the signals p, which may change during the step; and u is in the hull of the
 computed in floating point, with tolerances relative to the sizes of the terms.
 """
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear, nnls
 
-from cosim.analysis.conformance.trace import Trace
+from cosim.analysis.conformance.trace import Flags, Numbers, Trace
+from cosim.analysis.conformance.verdicts import Conformance, Failed, Failure
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 
 STATE, MOTION, INPUT, FACT = 1e-7, 1e-6, 1e-6, 1e-9
 """Largest differences that count as rounding: of z, of its motion, of u and of facts, relative."""
 CLOCK_NS = 2
-_MOST_HULLS = 300
+_MOST_HULLS = 60
 """Steps at which the hull of several inputs is tested; a single input is tested at all steps."""
 _TINY = 1e-12
-_PROJECTIONS = 60
-_LEAST_DIRECTION = 0.02
-"""Directions in which signals have a smaller share of their effect are left out."""
+_PROJECTIONS, _PARTS = 60, 8
+_SMALLEST_EFFECT = 0.1
+"""Directions in which signals have a smaller effect, in units of what counts as rounding, are left out."""
 Table = Mapping[str, Any]
 
 
 class RefutedError(Exception):
     """The trace is no run of the document."""
 
-    def __init__(self, t_s: float, what: str) -> None:
-        super().__init__(f"{what}, at {t_s:.6g} s")
-        self.t_s, self.what = t_s, what
-
-
-class Conformance(NamedTuple):
-    """Whether a run is one of a document."""
-
-    until_s: float
-    """Up to this time."""
-    reason: str
-    """What failed then; empty: the whole run is one of the document."""
-    edges: Mapping[str, int]
-    """How often each edge of the document was taken."""
-    clocks: Mapping[str, float]
-    """By location, the largest share of its clock's limit that was reached."""
-    document: str
-    """Name of the document."""
-
-    @property
-    def conforms(self) -> bool:
-        """Whether the whole run is a run of the document."""
-        return not self.reason
-
-    @property
-    def verdict(self) -> str:
-        """The result in one sentence."""
-        taken = sum(count > 0 for count in self.edges.values())
-        coverage = f"{taken} of the document's {len(self.edges)} kinds of transitions occurred"
-        if self.conforms:
-            return (
-                f"the run is a run of the loop document {self.document!r}, so the bounds of states, outputs "
-                f"and inputs that are proved of this document hold for the run; {coverage}"
-            )
-        return (
-            f"the run is a run of the loop document {self.document!r} until {self.until_s:.6g} s only: "
-            f"{self.reason}; from then on the bounds that are proved of this document need not hold; "
-            f"{coverage}"
-        )
+    def __init__(self, failure: Failure) -> None:
+        super().__init__(f"{failure.kind}: {failure.place}")
+        self.failure = failure
 
 
 def compare(trace: Trace, document: Table) -> Conformance:
     """Return whether a trace is a run of a document."""
     checked = _Checked(trace, document)
-    failures: list[RefutedError] = []
+    failures: list[Failure] = []
     for check in (checked.path, checked.edges, checked.locations, checked.motions, checked.record):
         try:
             check()
         except RefutedError as refuted:
-            failures.append(refuted)
+            failures.append(refuted.failure)
     first = min(failures, key=lambda failure: failure.t_s, default=None)
     until_s = float(trace.t_ns[-1]) / NS_PER_S if first is None else first.t_s
-    names = [edge["name"] for edge in document["edges"] if edge["to"] is not None]
-    taken = Counter(item.name for item in trace.items if not item.is_motion)
-    counts = {name: taken[name] for name in names}
-    reason = "" if first is None else first.what
-    return Conformance(until_s, reason, counts, checked.clock_shares(), document["name"])
+    share = float(trace.is_sampled.mean()) if len(trace.items) else 1.0
+    return Conformance(document["name"], until_s, first, checked.edge_counts(), checked.clock_shares(), share)
 
 
 @dataclass
@@ -123,64 +87,92 @@ class _Checked:
         self._locations = {location["name"]: location for location in document["locations"]}
         self._edges = {edge["name"]: edge for edge in document["edges"]}
         self._rows = {name: _matrix(rows) for name, rows in document["rows"].items()}
-        self._z, self._clocks_ns = trace.z, np.array(trace.clocks_ns)
-        self._t_s = trace.t_ns[np.array(trace.steps)] / NS_PER_S
-        self._is_motion = np.array([item.is_motion for item in trace.items], dtype=bool)
-        self._by_name: dict[str, list[int]] = {}
-        for index, item in enumerate(trace.items):
-            self._by_name.setdefault(item.name, []).append(index)
+        self._clocks_ns, self._is_motion = trace.clocks_ns, trace.is_motion
+        self._t_s = trace.t_ns[trace.steps] / NS_PER_S
+        self._largest = float(np.abs(trace.z[:, self._states]).max(initial=0.0)) or 1.0
+        self._number = {name: number for number, name in enumerate(trace.names)}
 
     # The path.
 
     def path(self) -> None:
         """Require that the path begins at the start, has all steps, and that items follow each other."""
-        start, place = self._document["start"], self._document["start"]["location"]
-        Z = _matrix(start["columns"])
-        noise = self._z[0, self._noise]
-        self._require_near(
-            0, self._z[0, self._states], (Z @ np.append(1.0, noise))[self._states], "z at the start"
+        trace, start = self._trace, self._document["start"]
+        self._require_start(start)
+        sources, targets = (
+            np.array([self._end(name, index, is_first=is_first) for name in trace.names for index in (0, 1)])
+            for is_first in (True, False)
         )
-        steps = np.array(self._trace.steps)
+        which = 2 * trace.items + trace.is_motion
+        begins, ends = sources[which], targets[which]
+        expected = np.append([self._place_number(start["location"])], ends[:-1])
+        known = begins >= 0
+        if (wrong := np.flatnonzero(~known | (begins != expected) | (ends < 0))).size:
+            index = int(wrong[0])
+            name, t_s = trace.names[trace.items[index]], float(self._t_s[index])
+            unknown = trace.unknown.get(name)
+            place = name if unknown is None else unknown.transition.source
+            raise RefutedError(Failure(t_s, Failed.EDGE, place, unknown=unknown))
+        steps = trace.steps
+        going = np.asarray(np.diff(steps) == trace.is_motion)
+        self._require(np.arange(len(going)), going, Failed.PATH, "", "the path does not go step by step")
+        is_known = trace.rows >= 0
         self._require(
-            np.arange(len(steps) - 1), np.diff(steps) == self._is_motion, "the path does not go step by step"
+            np.arange(len(going)),
+            ~trace.is_sampled | (is_known[:-1] & is_known[1:]),
+            Failed.PATH,
+            "",
+            "the trace has no z",
         )
-        if steps[0] != 0 or steps[-1] != len(self._trace.t_ns) - 1:
-            raise RefutedError(float(self._t_s[-1]), "the path does not have all steps of the record")
-        for index, item in enumerate(self._trace.items):
-            if item.is_motion:
-                if item.name != place or item.name not in self._locations:
-                    raise RefutedError(
-                        float(self._t_s[index]), f"time passes in {item.name!r} after {place!r}"
-                    )
-                continue
-            edge = self._edges.get(item.name)
-            if edge is None or edge["from"] != place or edge["to"] is None:
-                raise RefutedError(float(self._t_s[index]), f"the document has no transition {item.name!r}")
-            place = edge["to"]
+        if steps[0] != 0 or steps[-1] != len(trace.t_ns) - 1:
+            what = "the path does not have all steps of the record"
+            raise RefutedError(Failure(float(self._t_s[-1]), Failed.PATH, detail=what))
+
+    def _require_start(self, start: Table) -> None:
+        """Require that z is that of the start, where its facts hold."""
+        first = self._z(np.zeros(1, int))
+        Z, noise, z = _matrix(start["columns"]), first[0, self._noise], first[0, self._states]
+        expected = (Z @ np.append(1.0, noise))[self._states]
+        if (np.abs(z - expected) > STATE * (1 + np.abs(expected))).any():
+            raise RefutedError(Failure(float(self._t_s[0]), Failed.JUMP, "start"))
+        for fact in start["facts"]:
+            self._require(np.zeros(1, int), self._holds(fact, first), Failed.FACT, "start", fact)
+
+    def _place_number(self, name: str | None) -> int:
+        return -1 if name not in self._locations else list(self._locations).index(name)
+
+    def _end(self, name: str, is_motion: int, *, is_first: bool) -> int:
+        """Return the number of the location in which an item begins or ends; −1: the document has none."""
+        if is_motion:
+            return self._place_number(name)
+        edge = self._edges.get(name)
+        return -1 if edge is None else self._place_number(edge["from" if is_first else "to"])
 
     def edges(self) -> None:
         """Require that edges are taken at their times, where their facts hold, and that z jumps to J z."""
-        failures = []
-        for name, edge in self._edges.items():
-            if not (places := self._by_name.get(name)):
-                continue
-            at = np.array(places)
-            try:
-                self._edge(edge, at)
-            except RefutedError as refuted:
-                failures.append(refuted)
-        if failures:
-            raise min(failures, key=lambda failure: failure.t_s)
+        self._require_all(self._edge, ((edge, self._taken(name)) for name, edge in self._edges.items()))
 
-    def _edge(self, edge: Table, at: Vector) -> None:
-        clock, after = self._clocks_ns[at], self._clocks_ns[at + 1]
+    @staticmethod
+    def _require_all(check: Callable[..., None], calls: Iterable[tuple[Any, Numbers]]) -> None:
+        """Check each of several things that occurred; raise the first failure in time."""
+        failures = []
+        for what, at in calls:
+            if not len(at):
+                continue
+            try:
+                check(what, at)
+            except RefutedError as refuted:
+                failures.append(refuted.failure)
+        if failures:
+            raise RefutedError(min(failures, key=lambda failure: failure.t_s))
+
+    def _edge(self, edge: Table, at: Numbers) -> None:
+        if edge["to"] is None:
+            return  # then the path is none
+        name, clock, after = edge["name"], self._clocks_ns[at], self._clocks_ns[at + 1]
         if edge.get("when") is not None:
             first, last = (_value(end) * NS_PER_S for end in edge["when"])
-            self._require(
-                at,
-                (clock >= first - CLOCK_NS) & (clock <= last + CLOCK_NS),
-                f"{edge['name']}: the clock is not within {first / 1e6:g} to {last / 1e6:g} ms",
-            )
+            inside = (clock >= first - CLOCK_NS) & (clock <= last + CLOCK_NS)
+            self._require_clock(at, inside, Failed.WHEN, name, clock, (first, last))
         limit = self._locations[edge["to"]].get("clock")
         end = np.inf if limit is None else _value(limit) * NS_PER_S
         expected = {
@@ -188,107 +180,115 @@ class _Checked:
             "keeps": after == clock,
             "any": (after >= 0) & (after <= end + CLOCK_NS),
         }
-        self._require(at, expected[edge["clock"]], f"{edge['name']}: the clock is another one after it")
+        self._require_clock(at, expected[edge["clock"]], Failed.CLOCK, name, after, (0, end))
+        at = at[self._trace.is_sampled[at]]
+        z, then, J = self._z(at), self._z(at + 1), _matrix(edge["jump"])
         for fact in edge["facts"]:
-            self._require(at, self._holds(fact, self._z[at]), f"{edge['name']}: {fact!r} does not hold")
-        jumped = self._z[at] @ _matrix(edge["jump"]).T
-        scale = np.abs(self._z[at]) @ np.abs(_matrix(edge["jump"])).T
-        near = (
-            np.abs(self._z[at + 1] - jumped)
-            <= STATE * (scale + np.abs(self._z[at + 1])) + _TINY * self._size()
-        )
-        self._require(at, near[:, self._states].all(axis=1), f"{edge['name']}: z is another one after it")
+            self._require(at, self._holds(fact, z), Failed.FACT, name, fact)
+        room = STATE * (np.abs(z) @ np.abs(J).T + np.abs(then)) + _TINY * self._largest
+        near = np.abs(then - z @ J.T) <= room
+        self._require(at, np.asarray(near[:, self._states].all(axis=1)), Failed.JUMP, name)
 
     # Locations and motions.
 
     def locations(self) -> None:
         """Require of each location that its clock is within its limit, and that its facts hold."""
-        for name, location in self._locations.items():
-            at = self._motions_of(name)
-            if not len(at):
-                continue
-            moved = self._clocks_ns[at + 1] - self._clocks_ns[at]
-            dt = (self._t_s[at + 1] - self._t_s[at]) * NS_PER_S
-            self._require(at, np.abs(moved - dt) <= CLOCK_NS, f"{name}: the clock is not that of the record")
-            if location.get("clock") is not None:
-                limit = _value(location["clock"]) * NS_PER_S
-                self._require(
-                    at,
-                    self._clocks_ns[at + 1] <= limit + CLOCK_NS,
-                    f"{name!r} lasts longer than {limit / 1e6:g} ms",
-                )
-            outside = [
-                i for i in self._states if self._names[i] not in (*location["coordinates"], *self._units())
-            ]
-            zero = np.abs(self._z[at][:, outside]) <= STATE * self._size()
-            self._require(at, zero.all(axis=1), f"{name!r}: a coordinate that it lacks is not 0")
-            for fact in location["facts"]:
-                for ends in (at, at + 1):
-                    self._require(at, self._holds(fact, self._z[ends]), f"{name!r}: {fact!r} does not hold")
+        self._require_all(
+            self._location, ((each, self._motions_of(name)) for name, each in self._locations.items())
+        )
+
+    def _location(self, location: Table, at: Numbers) -> None:
+        name, after = location["name"], self._clocks_ns[at + 1]
+        moved = after - self._clocks_ns[at]
+        dt = (self._t_s[at + 1] - self._t_s[at]) * NS_PER_S
+        self._require_clock(at, np.abs(moved - dt) <= CLOCK_NS, Failed.CLOCK, name, after, (0, np.inf))
+        if location.get("clock") is not None:
+            limit = _value(location["clock"]) * NS_PER_S
+            self._require_clock(at, after <= limit + CLOCK_NS, Failed.LIMIT, name, after, (0, limit))
+        outside = [
+            i for i in self._states if self._names[i] not in (*location["coordinates"], *self._units())
+        ]
+        at = at[self._trace.is_sampled[at]]
+        zero = np.abs(self._z(at)[:, outside]) <= STATE * self._largest
+        self._require(at, np.asarray(zero.all(axis=1)), Failed.ZERO, name)
+        for fact in location["facts"]:
+            for ends in (at, at + 1):
+                self._require(at, self._holds(fact, self._z(ends)), Failed.FACT, name, fact)
 
     def motions(self) -> None:
         """Require that z moves as the motions say, for some signals, and that u is in their hull."""
-        for name, location in self._locations.items():
-            at = self._motions_of(name)
-            if not len(at):
-                continue
-            split = self._split(location["motion"])
-            self._flows(name, split, at)
-            self._inputs(name, split, at)
+        self._require_all(
+            self._motion, ((each, self._motions_of(name)) for name, each in self._locations.items())
+        )
 
-    def _flows(self, name: str, split: _Split, at: Vector) -> None:
-        dt_s, u = self._t_s[at + 1] - self._t_s[at], self._trace.u[np.array(self._trace.steps)[at]]
+    def _motion(self, location: Table, at: Numbers) -> None:
+        split, at = self._split(location["motion"]), at[self._trace.is_sampled[at]]
+        self._require_all(
+            lambda check, here: check(location["name"], split, here), ((self._flows, at), (self._inputs, at))
+        )
+
+    def _flows(self, name: str, split: _Split, at: Numbers) -> None:
+        dt_s, u = self._t_s[at + 1] - self._t_s[at], self._trace.u[self._trace.steps[at]]
         for length in np.unique(np.round(dt_s, 9)):
             here = at[np.round(dt_s, 9) == length]
             n, m, k = len(split.F), split.B.shape[1], split.columns.shape[1]
             whole = np.zeros((n + m + k, n + m + k))
             whole[:n, :n], whole[:n, n : n + m], whole[:n, n + m :] = split.F, split.B, split.columns
             moved = expm(whole * length)[:n]
-            now, then = self._z[here], self._z[here + 1]
+            now, then = self._z(here), self._z(here + 1)
             inputs = u[np.round(dt_s, 9) == length]
             rest = then - now @ moved[:, :n].T - inputs @ moved[:, n : n + m].T
             scale = np.abs(now) @ np.abs(split.F).T + np.abs(inputs) @ np.abs(split.B).T
-            allowed = MOTION * length * scale + STATE * 1e-3 * np.abs(then) + _TINY * self._size()
-            changes = min(float(np.linalg.norm(split.F, 2)) * length, 0.5)  # of a signal's effect in a step
+            allowed = MOTION * length * scale + STATE * 1e-3 * np.abs(then) + _TINY * self._largest
             columns = moved[self._states, n + m :]
-            free = allowed[:, self._states] + changes * np.abs(rest).max(axis=1, initial=0)[:, None] * bool(
-                columns.size
-            )
-            explained = self._explained(rest[:, self._states], free, columns, split, now, then)
-            self._require(here, explained, f"{name!r}: no motion of the document leads to what was recorded")
+            varied = _variation(split, length)[self._states]
+            free = allowed[:, self._states]
+            explained = self._explained(rest[:, self._states], free, columns, varied, split, now, then)
+            self._require(here, explained, Failed.MOTION, name)
 
     @staticmethod
     def _explained(
-        rest: Vector, free: Vector, columns: Matrix, split: _Split, now: Vector, then: Vector
-    ) -> Vector:
+        rest: Vector,
+        free: Vector,
+        columns: Matrix,
+        varied: Matrix,
+        split: _Split,
+        now: Vector,
+        then: Vector,
+    ) -> Flags:
         """Return which rests are Σ column p with |p| ≤ |Rz|, but for what is ``free``.
 
-        Signals may vary during a step: |Rz| is the larger one of both ends, plus what it changes by. Signals
-        are found by projections in turn, on those that explain the rest and on those within their limits.
+        Signals may vary during a step: |Rz| is the larger one of both ends, plus what it changes by; and what
+        a signal that varies has more or less than a constant one is free, too. Signals are found by
+        projections in turn, on those that explain the rest and on those within their limits.
         """
         if not columns.shape[1]:
             return np.asarray((np.abs(rest) <= free).all(axis=1))
         sizes = [[np.linalg.norm(z @ R.T, axis=1) for z in (now, then, then - now)] for R in split.rows]
         limits = np.stack([np.maximum(first, last) + change for first, last, change in sizes], axis=1)
-        scaled = columns * limits[:, None, :]  # (steps, coordinates, signals)
-        inverse, p = np.linalg.pinv(scaled, rcond=_LEAST_DIRECTION), np.zeros((*limits.shape, 1))
-        for _ in range(_PROJECTIONS):
-            p = np.clip(p + inverse @ (rest[:, :, None] - scaled @ p), -1.0, 1.0)
-        return np.asarray((np.abs(rest - (scaled @ p)[:, :, 0]) <= free).all(axis=1))
+        free = free + limits @ varied.T
+        near = np.abs(rest) <= free
+        explained = np.asarray(near.all(axis=1))
+        moved = columns.any(axis=1)  # the coordinates on which signals have an effect
+        open_ = np.flatnonzero(~explained & near[:, ~moved].all(axis=1))
+        unit, columns = free[np.ix_(open_, moved)], columns[moved]
+        effects = columns * limits[open_][:, None, :] / unit[:, :, None]  # (steps, coordinates, signals)
+        explained[open_] = _reachable(effects, rest[np.ix_(open_, moved)] / unit)
+        return explained
 
-    def _inputs(self, name: str, split: _Split, at: Vector) -> None:
-        u = self._trace.u[np.array(self._trace.steps)[at]]
+    def _inputs(self, name: str, split: _Split, at: Numbers) -> None:
+        u = self._trace.u[self._trace.steps[at]]
         for ends in (at, at + 1):
-            corners = np.stack([self._z[ends] @ U.T for U in split.U])  # (corners, steps, m)
-            scale = np.max([np.abs(self._z[ends]) @ np.abs(U).T for U in split.U], axis=0)
-            room = INPUT * scale + _TINY * self._size()
+            z = self._z(ends)
+            corners = np.stack([z @ U.T for U in split.U])  # (corners, steps, m)
+            scale = np.max([np.abs(z) @ np.abs(U).T for U in split.U], axis=0)
+            room = INPUT * scale + _TINY * self._largest
             inside = (u >= corners.min(axis=0) - room) & (u <= corners.max(axis=0) + room)
-            what = f"{name!r}: the input is none that the document allows"
-            self._require(at, inside.all(axis=1), what)
+            self._require(at, inside.all(axis=1), Failed.INPUT, name)
             if u.shape[1] > 1:
                 some = np.unique(np.linspace(0, len(at) - 1, min(len(at), _MOST_HULLS)).astype(int))
                 fits = np.array([_in_hull(corners[:, i], u[i], room[i]) for i in some])
-                self._require(at[some], fits, what)
+                self._require(at[some], fits, Failed.INPUT, name)
 
     def _split(self, motion: str) -> _Split:
         """Return the parts of a motion; raise RefutedError if its corners have no common part."""
@@ -304,17 +304,45 @@ class _Checked:
         differences = np.hstack([each - mean_U for each in U]), np.hstack([each - mean_F for each in F])
         B = differences[1] @ np.linalg.pinv(differences[0])
         if np.abs(B @ differences[0] - differences[1]).max(initial=0) > 1e-6 * (np.abs(mean_F).max() + _TINY):
-            raise RefutedError(0.0, f"the motion {motion!r} has no common part, and is not compared yet")
+            raise RefutedError(Failure(0.0, Failed.MOTION, motion, "its corners have no common part"))
         return _Split(np.asarray(mean_F - B @ mean_U), B, U, columns, rows)
 
     # The record.
 
     def record(self) -> None:
-        """Require that x is the recorded one."""
-        steps = np.array(self._trace.steps)
-        x = self._z[:, : self._trace.x.shape[1]]
-        near = np.abs(x - self._trace.x[steps]) <= STATE * np.abs(self._trace.x[steps])
-        self._require(np.arange(len(steps)), near.all(axis=1), "x is not the recorded one")
+        """Require that x is recorded at all steps, and that what is recorded is what z shows.
+
+        At a step x and x_s are those before what happens then, and x_c is the one of the input from then on.
+        """
+        if "x" not in self._document["readings"] or not np.isfinite(self._trace.readings["x"]).all():
+            raise RefutedError(Failure(float(self._t_s[0]), Failed.READING, detail="x"))
+        for name, parts in self._document["readings"].items():
+            recorded = self._trace.readings[name]
+            for part in parts:
+                rows, places = (
+                    _matrix(part["rows"]),
+                    [self._number[p] for p in part["in"] if p in self._number],
+                )
+                is_here = self._is_motion & self._trace.is_sampled & np.isin(self._trace.items, places)
+                here = np.flatnonzero(is_here)
+                at = here if name == "x_c" else here + 1
+                self._require_read(name, at, rows, recorded)
+                if name == "x":
+                    self._require_read(name, here[:1], rows, recorded)
+
+    def _require_read(self, name: str, at: Numbers, rows: Matrix, recorded: Vector) -> None:
+        found = recorded[self._trace.steps[at]]
+        known = np.isfinite(found).all(axis=1)
+        at, found = at[known], found[known]
+        z = self._z(at)
+        room = STATE * (np.abs(found) + np.abs(z) @ np.abs(rows).T) + _TINY * self._largest
+        near = np.abs(z @ rows.T - found) <= room
+        self._require(at, near.all(axis=1), Failed.READING, "", name)
+
+    def edge_counts(self) -> dict[str, int]:
+        """Return how often each edge was taken."""
+        taken = np.bincount(self._trace.items[~self._is_motion], minlength=len(self._trace.names))
+        return {name: int(taken[self._number[name]]) if name in self._number else 0 for name in self._edges}
 
     def clock_shares(self) -> dict[str, float]:
         """Return the largest share of each clock's limit."""
@@ -332,27 +360,82 @@ class _Checked:
         decaying = self._document.get("decaying")
         return [decaying["coordinate"] if decaying else "", self._document.get("constant") or ""]
 
-    def _motions_of(self, name: str) -> Vector:
-        places = [i for i in self._by_name.get(name, []) if self._is_motion[i]]
-        return np.array(places, dtype=int)
+    def _z(self, at: Numbers) -> Matrix:
+        """Return z of states, (k, coordinates), which are before or after sampled items."""
+        return np.asarray(self._trace.z[self._trace.rows[at]])
 
-    def _holds(self, fact: str, z: Vector) -> Vector:
+    def _motions_of(self, name: str) -> Numbers:
+        """Return the items in which time passes in a location."""
+        return np.flatnonzero(self._is_motion & (self._trace.items == self._number.get(name, -1)))
+
+    def _taken(self, name: str) -> Numbers:
+        """Return the items that are an edge."""
+        return np.flatnonzero(~self._is_motion & (self._trace.items == self._number.get(name, -1)))
+
+    def _holds(self, fact: str, z: Vector) -> Flags:
         left, right = (
             sum((np.square(z @ self._rows[name].T).sum(axis=1) for name in names), np.zeros(len(z)))
             for names in (self._document["facts"][fact]["less"], self._document["facts"][fact]["more"])
         )
         return np.asarray(left <= right * (1 + FACT) + _TINY**2)
 
-    def _size(self) -> float:
-        return float(np.abs(self._z[:, self._states]).max()) or 1.0
-
-    def _require(self, at: NDArray[Any], holds: NDArray[Any], what: str) -> None:
+    def _require(self, at: Numbers, holds: Flags, kind: Failed, place: str, detail: str = "") -> None:
         if not holds.all():
-            raise RefutedError(float(self._t_s[at[int(np.argmin(holds))]]), what)
+            first = at[int(np.argmin(holds))]
+            raise RefutedError(Failure(float(self._t_s[first]), kind, place, detail))
 
-    def _require_near(self, index: int, found: Vector, expected: Vector, what: str) -> None:
-        if (np.abs(found - expected) > STATE * (1 + np.abs(expected))).any():
-            raise RefutedError(float(self._t_s[index]), f"{what} is another one")
+    def _require_clock(
+        self,
+        at: Numbers,
+        holds: Flags,
+        kind: Failed,
+        place: str,
+        clock_ns: Numbers,
+        allowed_ns: tuple[float, float],
+    ) -> None:
+        if not holds.all():
+            first = int(np.argmin(holds))
+            found, low, high = (float(value) / NS_PER_S for value in (clock_ns[first], *allowed_ns))
+            raise RefutedError(Failure(float(self._t_s[at[first]]), kind, place, "", found, low, high))
+
+
+def _reachable(effects: Vector, rest: Vector) -> Flags:
+    """Return which rests are effects times numbers from −1 to 1, up to about 1 in each coordinate.
+
+    Args:
+        effects: (k, coordinates, signals).
+        rest: (k, coordinates).
+    """
+    found, open_ = np.zeros(len(rest), dtype=bool), np.arange(len(rest))
+    U, sizes, V = np.linalg.svd(effects, full_matrices=False)
+    with np.errstate(divide="ignore"):
+        inverse = V.transpose(0, 2, 1) * np.where(sizes > _SMALLEST_EFFECT, 1 / sizes, 0.0)[:, None, :]
+    inverse = inverse @ U.transpose(0, 2, 1)
+    p, most = np.zeros((len(rest), effects.shape[2], 1)), np.sqrt(rest.shape[1])
+    for _ in range(_PROJECTIONS):
+        left = rest[open_, :, None] - effects[open_] @ p[open_]
+        is_open = np.linalg.norm(left[:, :, 0], axis=1) > most
+        found[open_[~is_open]] = True
+        open_, left = open_[is_open], left[is_open]
+        if not len(open_):
+            return found
+        p[open_] = np.clip(p[open_] + inverse[open_] @ left, -1.0, 1.0)
+    for index in open_.tolist():
+        best = lsq_linear(effects[index], rest[index], (-1.0, 1.0))
+        if np.linalg.norm(best.fun) > most:
+            break  # the first one that is not reachable is enough
+        found[index] = True
+    return found
+
+
+def _variation(split: _Split, length_s: float) -> Matrix:
+    """Return by how much a varying signal of size 1 may move z otherwise than a constant one, (n, signals).
+
+    Its effect is ∫ g p ds with g = e^{F(T − s)} c, so this is ∫ |g − mean of g| ds.
+    """
+    parts = np.linspace(0.0, length_s, 2 * _PARTS + 1)[1::2]
+    effects = np.stack([expm(split.F * s) @ split.columns for s in parts])
+    return np.asarray(length_s * np.abs(effects - effects.mean(axis=0)).mean(axis=0))
 
 
 def _in_hull(corners: Matrix, u: Vector, room: Vector) -> bool:
@@ -370,4 +453,10 @@ def _value(entry: Any) -> float:
 
 
 def _matrix(rows: Sequence[Sequence[Any]]) -> Matrix:
+    try:
+        plain = np.array(rows, dtype=float)
+    except ValueError:  # it has quotients or intervals
+        plain = np.zeros(0)
+    if plain.ndim == 2:
+        return plain
     return np.array([[_value(entry) for entry in row] for row in rows], dtype=float)

@@ -1,16 +1,24 @@
 """The conformance of a recorded loop with the loop document of its scenario's bounds."""
 
-from cosim.analysis.claims.common_end import up_to_common_end
-from cosim.analysis.claims.reference_deviations import deviations
-from cosim.analysis.conformance.conformance import Conformance, compare
-from cosim.analysis.conformance.trace import trace_of
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from cosim.analysis.conformance.common_end import up_to_common_end
+from cosim.analysis.conformance.conformance import compare
+from cosim.analysis.conformance.run_document import RunDocument, document_of_statement
+from cosim.analysis.conformance.trace import MOST_ITEMS, trace_of
+from cosim.analysis.conformance.verdicts import Conformance
 from cosim.analysis.loop_files import naming_of, widest
 from cosim.analysis.witnesses import WitnessedStatement, find_witnesses, plants_of
 from cosim.record.run_record import RunRecord
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.proof.files import document_of
+from noack.core.references import Reference
 from noack.proof.loop_document import NoDocumentError
 from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
 
 
 def conformance_of(record: RunRecord, plants: str | None = None) -> Conformance:
@@ -44,10 +52,41 @@ def conformance_with(record: RunRecord, statement: WitnessedStatement) -> Confor
             f"nothing is proved of the loop, so there is no loop document to compare: {statement.reason}"
         )
     try:
-        document = document_of(statement.loop, statement.document, naming_of(record.scenario, statement))
-        whole = up_to_common_end(record)
-        if (reference := loop_of(record.scenario).reference) is not None:
-            whole = deviations(whole, reference)
-        return compare(trace_of(whole, document), document.table)
+        document = document_of_statement(statement, naming_of(record.scenario, statement))
     except NoDocumentError as error:
         raise CallerError(f"there is no loop document: {error}") from None
+    return conformance(record, document)
+
+
+def conformance(
+    record: RunRecord, document: RunDocument, until_s: float = math.inf, most_items: int = MOST_ITEMS
+) -> Conformance:
+    """Return whether a recorded loop is a run of a document, up to a time.
+
+    Args:
+        record: of the loop; of a stopped run, it is compared up to its common end.
+        document: of the loop.
+        until_s: end of the comparison.
+        most_items: so many steps are compared in all numbers, see :func:`trace_of`.
+
+    Raises:
+        CallerError: the record cannot be compared with the document; the message says why.
+    """
+    until_ns = None if until_s == math.inf else round(until_s * NS_PER_S)
+    reference = reference_of_bounds(record.scenario)
+    trace = trace_of(up_to_common_end(record), document, reference, until_ns, most_items)
+    found = compare(trace, document.table)
+    if (failure := found.failure) is None:
+        return found
+    step = int(np.searchsorted(trace.t_ns, round(failure.t_s * NS_PER_S)))
+    sources = {edge["name"]: edge["from"] for edge in document.table["edges"]}
+    at = document.places.get(sources.get(failure.place, failure.place))
+    return found._replace(failure=replace(failure, at=at, input_age_s=float(trace.input_ages_s[step])))
+
+
+def reference_of_bounds(scenario: Scenario) -> Reference | None:
+    """Return what the bounds of a scenario are about: its reference, or its rest under constant loads."""
+    loop = loop_of(scenario)
+    if loop.reference is None and loop.loads:
+        return Reference.constant(loop.rest, loop.K @ loop.rest)
+    return loop.reference

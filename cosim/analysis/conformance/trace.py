@@ -1,304 +1,519 @@
-"""What a recorded loop did, in the words of its loop document: where it was, which edges it took, and z."""
+"""What a recorded loop did, in the words of its loop document: where it was, which edges it took, and z.
 
+A location changes only at some steps: at events, when an update begins to act, and at the silent tests that a
+document counts. :class:`_Walk` follows these; what each step needs is computed for all steps at once.
+"""
+
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.input_origins import plant_inputs
+from cosim.analysis.conformance.input_origins import PlantInputs, plant_inputs
+from cosim.analysis.conformance.run_document import RunDocument
+from cosim.analysis.conformance.verdicts import EdgeKind, Place, Transition, Unknown
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.core.linear_systems import Vector, exponential
-from noack.proof.loop_document import LoopDocument
-from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.theory.witnesses.coordinates import floats
+from noack.core.linear_systems import Propagator, Vector
+from noack.core.references import Reference
+from noack.protocol.record_tables import CONTROLLER_STEP, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 
 Numbers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 _PROJECTIONS = 200
-
-
-class Item(NamedTuple):
-    """A step of a trace: time passes in a location, or an edge is taken."""
-
-    name: str
-    """Of the location or of the edge."""
-    is_motion: bool
+_BETWEEN = 1.5
+"""A rule whose tests are further apart than this share of the measurements' period skips measurements."""
+_ROUNDED_NS = 2
+"""Times of steps differ from exact ones by at most this."""
+_NONE = -1
+"""Stands for no event."""
+MOST_ITEMS, _WINDOW = 25_000, 50
+"""Items of a trace of which z is known, at most, and consecutive ones of these."""
+_STAGES = 3
+"""States of a step of the plant: after the motion to it, after an update began to act, and after a test."""
+_MOVED, _ACTED, _TESTED = range(_STAGES)
 
 
 @dataclass
 class Trace:
-    """A path through a document. Item i leads from the i-th state to the next one."""
+    """A path through a document with k items. Item i leads from the i-th state to the next one."""
 
-    items: list[Item] = field(default_factory=list)
-    steps: list[int] = field(default_factory=list)
-    """The plant's step of each state, one more than items."""
-    clocks_ns: list[int] = field(default_factory=list)
-    z: Vector = field(default_factory=lambda: np.zeros((0, 0)))
-    """(states, coordinates)"""
-    t_ns: Numbers = field(default_factory=lambda: np.zeros(0, np.int64))
+    names: list[str]
+    """Names of locations and edges."""
+    items: Numbers
+    """(k,) Each item's place in ``names``: of the location in which time passes, or of the edge."""
+    is_motion: Flags
+    """(k,) Whether time passes, or an edge is taken."""
+    steps: Numbers
+    """(k + 1,) The plant's step of each state."""
+    clocks_ns: Numbers
+    """(k + 1,)"""
+    is_sampled: Flags
+    """(k,) Of which items z is known before and after; of a long run a part."""
+    rows: Numbers
+    """(k + 1,) The place of each state in ``z``; −1: it is not known."""
+    z: Vector
+    """(known states, coordinates)"""
+    t_ns: Numbers
     """(steps,) Times of the plant's steps."""
-    x: Vector = field(default_factory=lambda: np.zeros((0, 0)))
-    u: Vector = field(default_factory=lambda: np.zeros((0, 0)))
-    """(steps, n) and (steps, m) As they were recorded."""
+    u: Vector
+    """(steps, m) The input as it was recorded, minus that of the reference for its time."""
+    readings: dict[str, Vector]
+    """(steps, rows) each: what was recorded of x, and of x_s and x_c. NaN: nothing at this step."""
+    unknown: dict[str, Unknown] = field(default_factory=dict)
+    """What happened at edges that the document lacks, by the name in ``names``."""
+    input_ages_s: Vector = field(default_factory=lambda: np.zeros(0))
+    """(steps,) Ages of the inputs at the steps; they may be below 0."""
 
 
-class _State(NamedTuple):
-    """What determines z between two items."""
+class _LocationChange(NamedTuple):
+    """What changes at a step, and what then is."""
 
-    step: int
+    key: int
+    """The step times ``_STAGES``, plus the stage."""
+    location: str
     events: int
     """So many events happened."""
     acting: int
-    """The event whose update acts; −1: none."""
+    """The event whose update acts; ``_NONE``: none."""
     following: int
-    """The event whose update acts next; −1: none that was sent."""
+    """The event whose update acts next; ``_NONE``: none that was sent."""
+    edge: str = ""
 
 
-def trace_of(record: RunRecord, document: LoopDocument) -> Trace:
+def trace_of(
+    record: RunRecord,
+    document: RunDocument,
+    reference: Reference | None = None,
+    until_ns: int | None = None,
+    most_items: int = MOST_ITEMS,
+) -> Trace:
     """Return the trace of a recorded loop.
+
+    Args:
+        record: of the loop.
+        document: of the loop.
+        reference: in whose coordinates the document is; None: 0.
+        until_ns: end of the trace; None: the end of the record.
+        most_items: so many items have z before and after; of a longer trace some at a time, evenly spread.
 
     Raises:
         CallerError: the document has parts that the record does not show, or the record is too short.
     """
-    loop = document.loop
-    if loop.loads or loop.until is not None or loop.offset != 0:
-        raise CallerError(
-            "a loop with a load, or with a reference that moves, cannot be compared with a loop "
-            "document yet; noack summary shows which claims the run was checked against"
-        )
-    if document.model.is_by_tests or not (loop.times.sampling > 0 or document.model.is_periodic):
-        raise CallerError(
-            "a loop document with tests at exact times, or at all times, cannot be compared with a run yet; "
-            "noack summary shows which claims the run was checked against"
-        )
-    return _Tracer(record, document).trace()
+    return _Tracer(record, document, reference, until_ns).trace(most_items)
 
 
 class _Tracer:
-    def __init__(self, record: RunRecord, document: LoopDocument) -> None:
-        self._document, self._model = document, document.model
-        steps, tests = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
-        self._t_ns, self._x, self._u = steps["t_ns"], steps["x"], steps["u"]
-        place = np.searchsorted(self._t_ns, tests["t_ns"])
-        inside = place < len(self._t_ns)
-        tests, place = tests[inside], place[inside]
-        if len(self._t_ns) < 2 or not (self._t_ns[place] == tests["t_ns"]).all():
+    def __init__(
+        self, record: RunRecord, document: RunDocument, reference: Reference | None, until_ns: int | None
+    ) -> None:
+        self._document, self._reference = document, reference
+        steps = record.columns(PLANT_STEP, "t_ns", "x", "u")
+        tests = record.columns(SENSOR_MEASUREMENT, "t_ns", "x", "x_s", "event")
+        if until_ns is not None:
+            steps = steps[steps["t_ns"] <= until_ns]
+        self._t_ns = steps["t_ns"]
+        at = np.searchsorted(self._t_ns, tests["t_ns"])
+        inside = at < len(self._t_ns)
+        tests, at = tests[inside], at[inside]
+        if len(self._t_ns) < 2 or not (self._t_ns[at] == tests["t_ns"]).all():
             raise CallerError("a measurement is not one of a step of the plant")
-        self._tests = {int(k): row for k, row in zip(place, range(len(tests)), strict=True)}
-        events = tests["event"] != NO_SEQUENCE
-        self._sent_step, self._sent_x = place[events], tests["x"][events]
-        self._measured, self._is_event = tests["x"], events
-        knows_start = record.scenario.network.initial_sync == "known_state"
-        if knows_start:  # as if x(0) had been sent, and had arrived
+        is_test = self._is_compared(at, tests["event"] != NO_SEQUENCE)
+        tests, at = tests[is_test], at[is_test]
+        self._n = document.H.shape[0]
+        self._x = self._about(steps["x"], self._t_ns)
+        self._period_ns = int(self._t_ns[1] - self._t_ns[0])
+        self._propagate = Propagator(document.H)
+        self._test_steps, self._measured = at, self._about(tests["x"], tests["t_ns"])
+        self._is_test = np.zeros(len(self._t_ns), dtype=bool)
+        self._is_test[at] = True
+        is_event = tests["event"] != NO_SEQUENCE
+        self._is_event = np.zeros(len(self._t_ns), dtype=bool)
+        self._is_event[at[is_event]] = True
+        self._sent_step, self._sent_x = at[is_event], self._measured[is_event]
+        self._begin_with(knows_start=record.scenario.network.initial_sync == "known_state")
+        inputs = plant_inputs(record)
+        virtual = len(self._sent_step) - int(is_event.sum())
+        numbers = {int(sequence): i for i, sequence in enumerate(tests["event"][is_event], virtual)}
+        self._acts = self._acting_steps(record, inputs, numbers)
+        self._order = sorted(self._acts.values())
+        waited_ns = self._t_ns[-1] - self._t_ns[self._sent_step]
+        last = self._order[-1] if self._order else _NONE
+        # What was sent last may be on its way when the record ends.
+        in_flight = np.flatnonzero(waited_ns <= document.delay_ns)
+        self._order += in_flight[in_flight > last].tolist()
+        self._u = self._feedback(steps["u"], inputs)
+        self._ages_s = (self._t_ns - inputs.input_ns[: len(self._t_ns)]) / NS_PER_S
+        self._readings = {
+            "x": self._x,
+            "x_s": self._rows_at(at, self._about(tests["x_s"], tests["t_ns"])),
+            "x_c": self._controller_states(record, inputs),
+        }
+
+    def _is_compared(self, at: Numbers, is_event: Flags) -> Flags:
+        """Return which measurements the rule tests: some rules do not test each of them."""
+        test_ns, dwell_ns = self._document.test_ns, self._document.dwell_ns
+        t_ns = self._t_ns[at]
+        if len(at) < 2 or (not dwell_ns and test_ns <= _BETWEEN * float(np.diff(t_ns).min())):
+            return np.ones(len(at), dtype=bool)
+        events = np.union1d(0, np.flatnonzero(is_event))  # the start is one
+        last = np.searchsorted(events, np.arange(len(at)), "left") - 1  # the event before each measurement
+        since_ns = t_ns - t_ns[events[np.maximum(last, 0)]] - dwell_ns
+        tests = np.round(since_ns / test_ns)
+        is_due = (tests >= 0) & (np.abs(since_ns - tests * test_ns) <= _ROUNDED_NS)
+        return np.asarray(is_event | is_due)
+
+    def _about(self, x: Vector, t_ns: Numbers) -> Vector:
+        """Return states about the reference, (k, n)."""
+        return x if self._reference is None else x - self._reference.states(t_ns)[:, : self._n]
+
+    def _rows_at(self, at: Numbers, rows: Vector) -> Vector:
+        """Return rows at their steps, NaN at others."""
+        found = np.full((len(self._t_ns), rows.shape[1]), np.nan)
+        found[at] = rows
+        return found
+
+    def _begin_with(self, *, knows_start: bool) -> None:
+        """Require that the run begins with an event; a known start is as if x(0) had been sent."""
+        begins = bool(len(self._sent_step)) and self._sent_step[0] == 0
+        if knows_start and begins and not (self._sent_x[0] == self._x[0]).all():
+            raise CallerError("x(0) is known, and the sensor sends another one: no loop document says this")
+        if knows_start and not begins:
             self._sent_step = np.append(0, self._sent_step)
             self._sent_x = np.vstack([self._x[:1], self._sent_x])
-        if not len(self._sent_step) or self._sent_step[0] != 0 or (knows_start and self._sent_step[1:2] == 0):
+        elif not begins:
             raise CallerError(
-                "a run that does not begin with an event cannot be compared with a loop document yet"
+                "a run that does not begin with an event cannot be compared with a loop document"
             )
-        numbers = {int(sequence): i for i, sequence in enumerate(tests["event"][events], int(knows_start))}
-        self._acts = self._acting_steps(record, numbers, knows_start=knows_start)
-        self._H = floats(document.loop.H)
-        self._exponentials: dict[int, Vector] = {}
-        self._edges = {
-            (
-                document.model.locations[edge.source].name,
-                document.model.locations[edge.target].name,
-                _kind(name),
-            ): name
-            for edge, name in document.edges
-        }
-        for index in document.silent_locations:
-            name = document.model.locations[index].name
-            self._edges[name, name, "silent"] = f"{name}, silent"
-        self._names = {place.name for place in document.model.locations}
-        delay_ns = float(document.loop.times.delay.p) / float(document.loop.times.delay.q) * NS_PER_S
-        self._order = sorted(self._acts.values())
-        newest = len(self._sent_step) - 1
-        if newest not in self._order and self._t_ns[-1] - self._t_ns[self._sent_step[newest]] <= delay_ns:
-            self._order.append(newest)  # it may be on its way when the record ends
+        self._is_event[0] = False  # it is the start
 
     def _acting_steps(
-        self, record: RunRecord, numbers: dict[int, int], *, knows_start: bool
+        self, record: RunRecord, inputs: PlantInputs, numbers: Mapping[int, int]
     ) -> dict[int, int]:
         """Return by step the event whose update acts from it on, of several the newest one."""
         found: dict[int, int] = {}
-        inputs = plant_inputs(record)
-        if knows_start and np.isfinite(inputs.start_s):
+        end_ns = int(self._t_ns[-1])
+        if record.scenario.network.initial_sync == "known_state" and inputs.start_s * NS_PER_S <= end_ns:
             found[int(np.searchsorted(self._t_ns, round(inputs.start_s * NS_PER_S)))] = 0
         for update in inputs.updates:
-            if update.applied_ns is not None and update.sequence in numbers:
-                step = int(np.searchsorted(self._t_ns, update.applied_ns))
-                found[step] = max(found.get(step, -1), numbers[update.sequence])
-        newest, kept = -1, dict[int, int]()
+            at_ns = update.applied_ns
+            if at_ns is not None and at_ns <= end_ns and update.sequence in numbers:
+                step = int(np.searchsorted(self._t_ns, at_ns))
+                found[step] = max(found.get(step, _NONE), numbers[update.sequence])
+        newest, kept = _NONE, dict[int, int]()
         for step, event in sorted(found.items()):
             if event > newest:
                 newest = kept[step] = event
         return kept
 
-    def trace(self) -> Trace:
+    def _feedback(self, u: Vector, inputs: PlantInputs) -> Vector:
+        """Return the inputs, (steps, m): of a controller with a state, without those of the reference."""
+        if self._reference is None:
+            return u
+        count = len(self._t_ns)
+        of_reference = self._reference.rows(inputs.input_ns[:count])[:, self._n :]
+        return np.where(inputs.is_controlled[:count, None], u - of_reference, u)
+
+    def _controller_states(self, record: RunRecord, inputs: PlantInputs) -> Vector:
+        """Return the x_c from which each step's input was computed, as at the step, (steps, n)."""
+        count, ticks = len(self._t_ns), record.columns(CONTROLLER_STEP, "sequence", "model_t_ns", "x_c")
+        found = np.full((count, self._n), np.nan)
+        at = np.searchsorted(ticks["sequence"], inputs.actuation[:count])
+        known = inputs.is_controlled[:count] & (at < len(ticks["sequence"]))
+        known[known] = ticks["sequence"][at[known]] == inputs.actuation[:count][known]
+        at = at[known]
+        x_c = self._about(ticks["x_c"][at], ticks["model_t_ns"][at])
+        ages_ns = self._t_ns[known] - ticks["model_t_ns"][at]
+        ahead = ages_ns < 0
+        moved = self._propagate.advance_by(x_c, np.maximum(ages_ns, 0), self._period_ns)
+        if ahead.any():
+            back = Propagator(-self._document.H)
+            moved[ahead] = back.advance_by(x_c[ahead], -ages_ns[ahead], self._period_ns)
+        found[known] = moved
+        return found
+
+    # The path.
+
+    def trace(self, most_items: int) -> Trace:
         """Return the path and its states."""
-        trace = Trace(t_ns=self._t_ns, x=self._x, u=self._u)
-        states: list[_State] = []
-        first = self._order[0] if self._order else -1
-        place = self._document.table["start"]["location"]
-        is_started = not place.startswith("start")
-        now = _State(0, 1, 0 if is_started else -1, -1 if is_started else first)
-        clock = 0
-        trace.steps.append(0)
-        trace.clocks_ns.append(0)
-        states.append(now)
+        walk = _Walk(self._document, self._acts, self._order, self._is_event, self._is_test)
+        changes = [*walk.changes()]
+        last_step = len(self._t_ns) - 1 if walk.missing is None else changes[-1].key // _STAGES
+        keys = self._keys(changes, walk.is_shown, last_step)
+        at = np.searchsorted([change.key for change in changes], keys, "right") - 1
+        names: dict[str, int] = {}
+        locations = np.array([names.setdefault(change.location, len(names)) for change in changes])
+        edges = np.array([names.setdefault(change.edge, len(names)) for change in changes])
+        is_motion = keys[1:] % _STAGES == _MOVED
+        items = np.where(is_motion, locations[at[:-1]], edges[at[1:]])
+        silent = ~is_motion & (np.array([change.key for change in changes])[at[1:]] != keys[1:])
+        for index in np.unique(at[1:][silent]).tolist():  # silent tests that lead to where the loop is
+            edge = self._silent_edge(changes[index].location)
+            items[silent & (at[1:] == index)] = names.setdefault(edge, len(names))
+        unknown = {} if walk.missing is None else {changes[-1].edge: self._unknown(walk.missing)}
+        numbers = np.array([change[2:5] for change in changes], np.int64)[at]
+        steps = keys // _STAGES
+        is_lost = np.array([not self._is_waiting(change) for change in changes])[at]
+        is_sampled = _sample(len(items), most_items)
+        known = np.append(is_sampled, False) | np.append(False, is_sampled)
+        z = self._z(steps[known], numbers[known], is_lost[known])
+        self._add_noise(z, steps[known], np.append(is_motion, True)[known])
+        return Trace(
+            [*names], items, is_motion, steps, self._clocks(keys, changes, at), is_sampled,
+            np.where(known, np.cumsum(known) - 1, -1), z, self._t_ns, self._u, self._readings, unknown,
+            self._ages_s,
+        )  # fmt: skip
 
-        def take(item: Item, state: _State, clock_ns: int) -> None:
-            trace.items.append(item)
-            trace.steps.append(state.step)
-            trace.clocks_ns.append(clock_ns)
-            states.append(state)
+    def _unknown(self, missing: Transition) -> Unknown:
+        places, wanted = self._document.places.values(), missing.target
+        alike = [each.number for each in places if each[:2] == wanted[:2]]
+        return Unknown(missing, max(alike, default=-1))
 
-        for step in range(len(self._t_ns)):
-            if step:
-                clock += int(self._t_ns[step] - self._t_ns[step - 1])
-                now = now._replace(step=step)
-                take(Item(place, True), now, clock)
-            if step in self._acts and self._acts[step] >= 0 and (step or not is_started):
-                now, target = self._after_arrival(now, self._acts[step])
-                clock = self._clock_after_arrival(now, step, clock)
-                take(Item(self._edge(place, target, "arrival"), False), now, clock)
-                place = target
-            if step == 0 or step not in self._tests:
-                continue
-            if self._is_event[self._tests[step]]:
-                now, target, clock = self._after_event(now, place, clock)
-                take(Item(self._edge(place, target, "event"), False), now, clock)
-                place = target
-            elif (edge := self._edges.get((place, place, "silent"))) is not None:
-                clock = 0
-                take(Item(edge, False), now, clock)
-        trace.z = np.array([self._z(state) for state in states])
-        self._add_noise(trace, states)
-        return trace
+    def _keys(self, changes: list[_LocationChange], is_shown: Mapping[str, bool], last_step: int) -> Numbers:
+        """Return the keys of all states: after each motion, arrival, and test that the document shows."""
+        changed = np.array([change.key for change in changes], np.int64)
+        at = np.searchsorted(changed, self._test_steps * _STAGES + _TESTED, "left") - 1
+        shown = np.array([is_shown.get(change.location, False) for change in changes])
+        tests = self._test_steps[shown[at] & (self._test_steps > 0) & (self._test_steps <= last_step)]
+        is_key = np.zeros((last_step + 1) * _STAGES, dtype=bool)
+        is_key[_MOVED::_STAGES] = True
+        is_key[changed] = True
+        is_key[tests * _STAGES + _TESTED] = True
+        keys = np.flatnonzero(is_key)
+        return keys[keys <= changed[-1]] if last_step < len(self._t_ns) - 1 else keys
 
-    def _edge(self, source: str, target: str, kind: str) -> str:
-        """Return the name of an edge; one that the document lacks has a name that is refuted."""
-        return self._edges.get((source, target, kind), f"{source} to {target}, {kind}")
+    def _silent_edge(self, location: str) -> str:
+        place = self._document.places[location]
+        return self._document.targets[Transition(location, EdgeKind.SILENT, place)].edge
 
-    def _after_arrival(self, now: _State, acting: int) -> tuple[_State, str]:
-        """Return the state and the location after an update began to act."""
-        missing = now.events - 1 - acting
-        following = next((e for e in self._order if acting < e < now.events), -1)
-        later = f"{now.events - 1 - following} later" if following >= 0 else f"{missing} lost"
-        return now._replace(acting=acting, following=following), later
+    def _is_waiting(self, change: _LocationChange) -> bool:
+        return change.following >= 0 or change.acting < 0
 
-    def _clock_after_arrival(self, now: _State, step: int, clock: int) -> int:
-        """Return the time since the update on its way was sent, or since the last test."""
-        if self._model.is_periodic:
-            return clock
-        if now.following >= 0:
-            return int(self._t_ns[step] - self._t_ns[self._sent_step[now.following]])
-        return int(self._t_ns[step] - self._t_ns[self._last_test(step)])
+    def _clocks(self, keys: Numbers, changes: list[_LocationChange], at: Numbers) -> Numbers:
+        """Return the clock of each state, (k + 1,)."""
+        document, steps = self._document, keys // _STAGES
+        t_ns, is_tested = self._t_ns[steps], keys % _STAGES == _TESTED
+        if document.is_periodic:
+            events = np.array([change.events for change in changes])[at]
+            return np.asarray(t_ns - self._t_ns[self._sent_step[events - 1]])
+        tests = self._test_steps
+        if not len(tests) or tests[0] > 0:
+            tests = np.append(0, tests)
+        before = np.searchsorted(tests, np.where(is_tested, steps + 1, steps), "left") - 1
+        since_test = t_ns - self._t_ns[tests[np.maximum(before, 0)]]
+        if document.is_by_tests:
+            return np.asarray(since_test)
+        following = np.array([change.following for change in changes])[at]
+        starts = np.array([self._starts(change.location) for change in changes])[at]
+        since_sent = t_ns - self._t_ns[self._sent_step[np.maximum(following, 0)]]
+        waiting = np.where(following >= 0, since_sent, since_test)
+        return np.asarray(np.where(starts, t_ns - self._t_ns[0], waiting))
 
-    def _last_test(self, step: int) -> int:
-        """Return the step of the last test before one."""
-        while step > 0:
-            step -= 1
-            if step in self._tests:
-                return step
-        return 0
-
-    def _after_event(self, now: _State, place: str, clock: int) -> tuple[_State, str, int]:
-        """Return the state, the location and the clock after an event."""
-        event = now.events
-        after = now._replace(events=event + 1)
-        if place.startswith("start"):
-            if now.following >= event or now.following < 0:  # no update that was sent before acts
-                return after, "start, 0 later", clock
-            return after, f"start, {event - now.following} later", clock
-        if now.following >= 0:
-            return after, f"{event - now.following} later", 0 if self._model.is_periodic else clock
-        if event in self._order:
-            return after._replace(following=event), "0 later" if "0 later" in self._names else "0 lost", 0
-        return after, f"{event - now.acting} lost", 0
+    def _starts(self, location: str) -> bool:
+        place = self._document.places.get(location)
+        return place is not None and place.starts
 
     # States.
 
-    def _flow(self, step: int, event: int) -> Vector:
-        """Return the state that an event sent, as the models move it up to a step."""
-        return self._moved(self._sent_x[event], int(self._t_ns[step] - self._t_ns[self._sent_step[event]]))
+    def _flow(self, events: Numbers, steps: Numbers) -> Vector:
+        """Return the states that events sent, as the models move them up to steps, (k, n)."""
+        ages_ns = self._t_ns[steps] - self._t_ns[self._sent_step[events]]
+        return self._propagate.advance_by(self._sent_x[events], ages_ns, self._period_ns)
 
-    def _moved(self, x: Vector, dt_ns: int) -> Vector:
-        if dt_ns not in self._exponentials:
-            self._exponentials[dt_ns] = exponential(self._H * (dt_ns * 1e-9))
-        return np.asarray(self._exponentials[dt_ns] @ x)
+    def _z(self, steps: Numbers, numbers: Numbers, is_lost: Flags) -> Vector:
+        """Return z of each state, (k + 1, coordinates); ``numbers`` are those of :class:`_LocationChange`."""
+        document, (events, acting, following) = self._document, numbers.T
+        newest = self._flow(events - 1, steps)
+        acts = acting >= 0
+        driving = newest.copy()
+        driving[acts] = self._flow(acting[acts], steps[acts])
+        x, reduce = self._x[steps], document.seen.T
+        z = x @ document.states
+        smooth, decaying = self._smooth(steps)
+        if smooth.shape[1]:
+            z += smooth @ document.decaying
+        error, w = newest - x - decaying, driving - newest
+        if document.is_periodic:  # then e is x_c − x where updates are lost, and w is 0
+            error, w = error + w * (is_lost & acts)[:, None], w * ~(is_lost & acts)[:, None]
+        z += error @ reduce @ document.errors[0] + w @ reduce @ document.errors[1]
+        for k, rows in enumerate(document.errors[2:]):
+            here = (following >= 0) & (following + k < events - 1)
+            later = self._flow(following[here] + k, steps[here]) - newest[here]
+            z[here] += later @ reduce @ rows
+        t_s = self._t_ns[steps] / NS_PER_S
+        for coordinate, unit in self._units():
+            z[:, coordinate] = np.exp(-unit * t_s)
+        return z
 
-    def _z(self, state: _State) -> Vector:
-        model, document = self._model, self._document
-        x = self._x[state.step]
-        newest = self._flow(state.step, state.events - 1)
-        acting = newest if state.acting < 0 else self._flow(state.step, state.acting)
-        parts = [(model.x, x)]
-        is_lost = state.following < 0 and state.acting >= 0
-        seen = None if model.sees_all else document.loop.seen
-        reduce = np.eye(len(x)) if seen is None else floats(seen)
-        smooth, decaying = self._smooth(state.step)
-        parts.append((model.s, smooth))
-        if model.is_periodic and is_lost:
-            parts.append((model.error_rows[0], reduce @ (acting - x - decaying)))
-        else:
-            parts.append((model.error_rows[0], reduce @ (newest - x - decaying)))
-            if state.acting >= 0:
-                parts.append((model.error_rows[1], reduce @ (acting - newest)))
-        if state.following >= 0:
-            for k, event in enumerate(range(state.following, state.events - 1)):
-                if k + 2 < len(model.error_rows):
-                    parts.append((model.error_rows[k + 2], reduce @ (self._flow(state.step, event) - newest)))
-        z = np.zeros(model.size)
-        for rows, value in parts:
-            z += floats(rows).T @ value
-        t_s = self._t_ns[state.step] * 1e-9
-        z[-2], z[-1] = np.exp(-float(document.rate) * t_s), 1.0
-        return z[document.used]
+    def _units(self) -> Iterator[tuple[int, float]]:
+        """Yield the coordinates of the units, and the rates at which they decay."""
+        names = [coordinate["name"] for coordinate in self._document.table["coordinates"]]
+        for unit, rate in (("f1", self._document.rate_per_s), ("f2", 0.0)):
+            if unit in names:
+                yield names.index(unit), rate
 
-    def _smooth(self, step: int) -> tuple[Vector, Vector]:
+    def _smooth(self, steps: Numbers) -> tuple[Vector, Vector]:
         """Return s, the decaying error of an observer's estimate, and its part of the estimate."""
-        smooth = self._model.bounds.smooth
-        if not self._model.s.nrows():
-            return np.zeros(0), np.zeros(len(self._x[0]))
-        moved = exponential(floats(smooth.rates) * (self._t_ns[step] * 1e-9))
-        s = moved @ floats(smooth.start)[:, 0]
-        return s, floats(smooth.columns) @ s
+        columns, rates, start = self._document.smooth
+        if not len(rates):
+            return np.zeros((len(steps), 0)), np.zeros((len(steps), self._n))
+        first = np.tile(start[:, 0], (len(self._t_ns), 1))
+        s = Propagator(rates).advance_by(first, self._t_ns, self._period_ns)[steps]
+        return s, s @ columns.T
 
-    def _add_noise(self, trace: Trace, states: list[_State]) -> None:
+    def _add_noise(self, z: Vector, steps: Numbers, is_before_motion: Flags) -> None:
         """Set the noise of each state that a test reads: what was measured, minus x and what decays."""
-        model = self._model
-        if not model.sources:
+        document = self._document
+        if not document.noise:
             return
-        columns, rate = floats(model.bounds.columns), float(self._document.rate)
-        at = [self._document.used.index(c) for c in model.sources]
-        for i, (item, state) in enumerate(zip(trace.items, states, strict=False)):
-            if (i == 0 or not item.is_motion) and state.step in self._tests:
-                noise = self._measured[self._tests[state.step]] - self._x[state.step]
-                limits = np.ones(columns.shape[1])
-                limits[: model.bounds.decaying] = np.exp(-rate * self._t_ns[state.step] * 1e-9)
-                trace.z[i, at] = _within(columns, noise - self._smooth(state.step)[1], limits)
+        reads = ~is_before_motion
+        reads[0] = True  # the start is an event
+        at = np.flatnonzero(reads & self._is_test[steps])
+        here = steps[at]
+        measured = self._measured[np.searchsorted(self._test_steps, here)]
+        limits = np.ones((len(at), len(document.noise)))
+        decay = np.exp(-document.rate_per_s * self._t_ns[here] / NS_PER_S)
+        limits[:, : document.decaying_noise] = decay[:, None]
+        noise = measured - self._x[here] - self._smooth(here)[1]
+        z[np.ix_(at, np.array(document.noise))] = _within(document.noise_columns, noise, limits)
+
+
+class _Walk:
+    """The changes of location of a run, in order.
+
+    Args:
+        document: of the loop.
+        acts: by step, the event whose update acts from it on.
+        order: the events whose updates act, in order.
+        is_event: which steps have an event, but for the start.
+        is_test: which steps have a test.
+    """
+
+    def __init__(
+        self,
+        document: RunDocument,
+        acts: Mapping[int, int],
+        order: list[int],
+        is_event: Flags,
+        is_test: Flags,
+    ) -> None:
+        self._document, self._acts, self._order = document, acts, order
+        self._is_event, self._is_test = is_event, is_test
+        self.missing: Transition | None = None
+        """What happened last, for which the document has no edge."""
+        self.is_shown = {name: self._stays(name, place) for name, place in document.places.items()}
+        """By location: whether silent tests lead back to it. Elsewhere they are not shown, or lead on."""
+
+    def _stays(self, location: str, place: Place) -> bool:
+        target = self._document.targets.get(Transition(location, EdgeKind.SILENT, place))
+        return target is not None and target.location == location
+
+    def changes(self) -> Iterator[_LocationChange]:
+        """Yield the start and each change, up to the first for which the document has no edge."""
+        start = self._document.table["start"]["location"]
+        starts = self._document.places[start].starts
+        first = self._order[0] if self._order else _NONE
+        now = _LocationChange(0, start, 1, _NONE if starts else 0, first if starts else _NONE)
+        yield now
+        marks = sorted({*self._acts, *np.flatnonzero(self._is_event).tolist()} - (set() if starts else {0}))
+        tests = np.flatnonzero(self._is_test)
+        done = 0
+        for mark in [*marks, len(self._is_test)]:
+            between = tests[np.searchsorted(tests, done, "right") : np.searchsorted(tests, mark, "left")]
+            for change in self._silent_tests(now, between):
+                yield (now := change)
+                if self.missing is not None:
+                    return
+            if mark == len(self._is_test):
+                return
+            if mark in self._acts:
+                yield (now := self._after_arrival(now, mark))
+                if self.missing is not None:
+                    return
+            if self._is_test[mark] and mark:
+                if self._is_event[mark]:
+                    yield (now := self._after_event(now, mark))
+                else:
+                    for change in self._silent_tests(now, np.array([mark])):
+                        yield (now := change)
+                if self.missing is not None:
+                    return
+            done = mark
+
+    def _silent_tests(self, now: _LocationChange, steps: Numbers) -> Iterator[_LocationChange]:
+        """Yield the changes of silent tests, up to a location to which they lead back."""
+        if not self._document.is_by_tests:
+            return
+        for step in steps.tolist():
+            if self.is_shown[now.location]:
+                return
+            now = self._taken(
+                now, step * _STAGES + _TESTED, EdgeKind.SILENT, self._document.places[now.location]
+            )
+            yield now
+            if self.missing is not None:
+                return
+
+    def _taken(self, now: _LocationChange, key: int, kind: EdgeKind, place: Place) -> _LocationChange:
+        """Return what is after an edge."""
+        wanted = Transition(now.location, kind, place)
+        target = self._document.targets.get(wanted)
+        if target is None:
+            self.missing = wanted
+            return now._replace(key=key, edge=f"{now.location}, {kind}, {place}")
+        return now._replace(key=key, location=target.location, edge=target.edge)
+
+    def _after_arrival(self, now: _LocationChange, step: int) -> _LocationChange:
+        acting = self._acts[step]
+        following = next((e for e in self._order if acting < e < now.events), _NONE)
+        now = now._replace(acting=acting, following=following)
+        last = now.events - 1
+        place = Place(False, True, last - following) if following >= 0 else Place(False, False, last - acting)
+        return self._taken(now, step * _STAGES + _ACTED, EdgeKind.ARRIVAL, place)
+
+    def _after_event(self, now: _LocationChange, step: int) -> _LocationChange:
+        event, source = now.events, self._document.places[now.location]
+        now = now._replace(events=event + 1)
+        if source.starts:
+            # of updates that were sent before, none acts: the start is as with this one
+            later = event - now.following if 0 <= now.following < event else 0
+            place = Place(True, True, later)
+        elif now.following >= 0:
+            place = Place(False, True, event - now.following)
+        elif event in self._order:
+            waits = any(each.waits and not each.starts for each in self._document.places.values())
+            now = now._replace(following=event if waits else _NONE)
+            place = Place(False, waits, 0)
+            if not waits:
+                now = now._replace(acting=event)
+        else:
+            place = Place(False, False, event - now.acting)
+        return self._taken(now, step * _STAGES + _TESTED, EdgeKind.EVENT, place)
+
+
+def _sample(items: int, most: int) -> Flags:
+    """Return which items are compared in all numbers, (items,): at most about ``most``, evenly spread."""
+    if items <= most:
+        return np.ones(items, dtype=bool)
+    starts = np.linspace(0, items - _WINDOW, max(most // _WINDOW, 1)).astype(np.int64)
+    found = np.zeros(items, dtype=bool)
+    found[(starts[:, None] + np.arange(_WINDOW)).ravel()] = True
+    return found
 
 
 def _within(columns: Vector, noise: Vector, limits: Vector) -> Vector:
-    """Return p with Σ column p = noise, within its limits if projections in turn find such a p."""
-    inverse = limits[:, None] * np.linalg.pinv(columns * limits)
-    p = inverse @ noise
+    """Return p with Σ column p = noise, (k, columns), within limits if projections in turn find such a p."""
+    scaled = columns * limits[:, None, :]
+    inverse = limits[:, :, None] * np.linalg.pinv(scaled)
+    p = (inverse @ noise[:, :, None])[:, :, 0]
     for _ in range(_PROJECTIONS):
-        if (np.abs(p) <= limits).all():
+        beyond = np.flatnonzero((np.abs(p) > limits).any(axis=1))
+        if not len(beyond):
             break
-        p = np.clip(p, -limits, limits)
-        p = p + inverse @ (noise - columns @ p)
+        inside = np.clip(p[beyond], -limits[beyond], limits[beyond])
+        rest = noise[beyond] - inside @ columns.T
+        p[beyond] = inside + (inverse[beyond] @ rest[:, :, None])[:, :, 0]
     return np.asarray(p)
-
-
-def _kind(name: str) -> str:
-    """Return the kind of an edge, by its name."""
-    last = name.split(" to ")[0].rsplit(", ", 1)[-1]
-    if last in ("event", "sent", "lost", "delivered"):
-        return "event"
-    return "silent" if last == "silent" else "arrival"

@@ -1,7 +1,7 @@
 """The summary of a loop, computed from its record."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, SupportsFloat, TypedDict
 
 import numpy as np
@@ -19,7 +19,7 @@ from cosim.analysis.summary.loop_statistics import (
 )
 from cosim.analysis.summary.output_statistics import output_parts
 from cosim.analysis.summary.signal_statistics import disturbances, signal_statistics
-from cosim.analysis.summary.summary_model import AssumptionPart, ChangePart, ExitPart, LoopSummary
+from cosim.analysis.summary.summary_model import ChangePart, ExitPart, LoopSummary
 from cosim.record.divergence import Divergence, divergence
 from cosim.record.run_events import changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
@@ -39,7 +39,6 @@ from noack.protocol.roles import FAILED, LOOP_ROLES
 from noack.protocol.wire_format import Flow
 from noack.scenario.runtime_parameters import text_of
 from noack.scenario.uneven_periods import uneven_periods
-from noack.theory.certificates.assumptions import Assumption, assumptions
 
 
 @np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same
@@ -48,12 +47,10 @@ def summarise_loop(
     exit_status: int,
     reason: str,
     phase_ns: int = 0,
-    assumed: Sequence[Assumption] = (),
 ) -> LoopSummary:
     """Return the summary of a loop, without the results of replay, ideal loop and claims.
 
-    ``exit_status`` and ``reason`` are those of the run; the loop may have failed nevertheless. The
-    assumptions of its scenario at the start may be known: ``assumed``.
+    ``exit_status`` and ``reason`` are those of the run; the loop may have failed nevertheless.
     """
     scenario, live = record.scenario, record.kind == "live"
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
@@ -72,8 +69,7 @@ def summarise_loop(
         actuations=flow_outcome(record, Flow.ACTUATION),
         **signals.for_summary(),
         outputs=output_parts(record),
-        assumption_violations=reported_violations(record),
-        assumptions=_assumptions(record, assumed or assumptions(scenario)),
+        violations=reported_violations(record),
         uneven_periods=uneven_periods(scenario),
         changes=change_parts(record),
         missing_samples=sum(missing.values()),
@@ -192,16 +188,6 @@ def _divergence(record: RunRecord) -> Divergence | None:
             text = f"the plant failed at {diverged.at_s:g} s: {notice['text']}"
             return diverged._replace(text=text)
     return diverged
-
-
-def _assumptions(record: RunRecord, at_start: Sequence[Assumption]) -> list[AssumptionPart]:
-    """Return the paper's assumptions; of those after a change of settings, the ones that differ."""
-    shown, latest = [*at_start], at_start
-    for change in changes_of(record):
-        since = f"from {change.change.t_ns / NS_PER_S:.3f} s on: "
-        before, latest = latest, assumptions(change.scenario)
-        shown += [status._replace(what=since + status.what) for status in latest if status not in before]
-    return [AssumptionPart(**status._asdict()) for status in shown]
 
 
 def change_parts(record: RunRecord) -> list[ChangePart]:

@@ -15,6 +15,7 @@ from pydantic import (
     model_validator,
 )
 
+from cosim.analysis.conformance.verdicts import Conformance, EdgeKind, Failed
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import at_least, at_most
 from noack.scenario.scenario import few_of
@@ -37,25 +38,13 @@ class SummaryPart(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
 
-class AssumptionPart(SummaryPart):
-    """An assumption of the paper, and whether the scenario meets it."""
-
-    what: str
-    source: str
-    verdict: str
-    why: str
-
-
 class ViolationPart(SummaryPart):
-    """An assumption that the run violated, first at ``t_s``."""
+    """What a process reported during the run: losses beyond the guarantee, or a change that came late."""
 
     t_s: float
     process: str
     cause: str
     what: str
-    """The largest excess."""
-    worst_at_s: float | None = None
-    """Its time; None if a process reported the violation when it occurred."""
 
 
 class Quantiles(SummaryPart):
@@ -211,17 +200,139 @@ class NoLinearisationPart(SummaryPart):
     A: None
 
 
+class PlacePart(SummaryPart):
+    """What the name of a location of a loop document says."""
+
+    starts: bool
+    """No input acts yet."""
+    waits: bool
+    """An update is on its way that will act."""
+    number: Count
+    """So many updates were sent after it; or so many are lost, if none is on its way."""
+
+
+class FailurePart(SummaryPart):
+    """What of a run is first not as its loop document says."""
+
+    kind: Annotated[Failed, Field(strict=False)]
+    place: str
+    """The location or the edge of the document."""
+    detail: str
+    """The name of a fact or of a reading."""
+    found_s: Real = None
+    """What a clock showed."""
+    low_s: Real = None
+    high_s: Real = None
+    """What it may show."""
+    at: PlacePart | None = None
+    """The location, or that from which the edge leads."""
+    happened: Annotated[EdgeKind | None, Field(strict=False)] = None
+    """What happened there, for which the document has no edge."""
+    then: PlacePart | None = None
+    """Where this would have led."""
+    most: Count | None = None
+    """The largest number that the document has for this."""
+    input_age_s: Real = None
+    """The age of the input at this time."""
+
+
+class ConformancePart(SummaryPart):
+    """Whether the run is a run of the loop document of a certificate."""
+
+    certificate: str
+    """The source of the claims whose bounds are proved of this document."""
+    document: str
+    """Its name; empty: no document describes the loop."""
+    missing: str = ""
+    """Why there is no document."""
+    until_s: Real = None
+    """The run is one of the document up to this time; None: to its end, or there is no document."""
+    failure: FailurePart | None = None
+    """What failed then."""
+    transitions: Count = 0
+    """So many edges the document has."""
+    transitions_taken: Count = 0
+    """So many of them the run took."""
+    share: float = 1.0
+    """Of the steps, so many were compared in all numbers; edges, clocks and times always are."""
+
+    @classmethod
+    def of(cls, found: Conformance, certificate: str) -> Self:
+        """Return the part of a result."""
+        failure, place = found.failure, None
+        if failure is not None:
+            unknown = failure.unknown
+            place = FailurePart(
+                kind=failure.kind,
+                place=failure.place,
+                detail=failure.detail,
+                found_s=failure.found,
+                low_s=failure.low,
+                high_s=failure.high,
+                at=None if failure.at is None else PlacePart(**failure.at._asdict()),
+                happened=None if unknown is None else unknown.transition.kind,
+                then=None if unknown is None else PlacePart(**unknown.transition.target._asdict()),
+                most=None if unknown is None or unknown.most < 0 else unknown.most,
+                input_age_s=failure.input_age_s,
+            )
+        return cls(
+            certificate=certificate,
+            document=found.document,
+            until_s=None if failure is None else failure.t_s,
+            failure=place,
+            transitions=len(found.edges),
+            transitions_taken=sum(count > 0 for count in found.edges.values()),
+            share=found.share,
+        )
+
+
 class ClaimVerdict(StrEnum):
     """The result of checking a claim against a run."""
 
     HELD = "held"
     VIOLATED = "violated"
-    VOID = "void"
-    """An assumption of the claim was violated before the end of the run, or it has none to hold: there is
-    no certificate, or a setting changed before anything could be compared."""
+    ENDED = "ended"
+    """The bound held until ``since_s``, and nothing is claimed from then on: the cause says why."""
+    UNCHECKED = "unchecked"
+    """Nothing was compared: there is no bound, or no document to compare the run with."""
     NOT_APPLICABLE = "not applicable"
     """The bound was exceeded, but no sampled loop meets the claim's assumptions: this run does not
     refute it."""
+
+
+class ClaimCause(StrEnum):
+    """Why a claim ended, or was not checked. The words are in ``cosim/output/claim_words.py``."""
+
+    CONFORMANCE = "conformance"
+    """The run is not one of the loop document from then on."""
+    NO_DOCUMENT = "no document"
+    """No document describes the loop, so that no run can be compared with it."""
+    NO_CERTIFICATE = "no certificate"
+    CHANGED = "changed"
+    """Settings changed before anything could be compared."""
+    OUTSIDE = "outside"
+    """The plant is outside of its uncertainty."""
+    MISSING_ROWS = "missing rows"
+    """Rows of a process are missing from the record."""
+    MISSING_MEASUREMENT = "missing measurement"
+    NO_ERROR = "no error"
+    """The controller's error is not on record, or not finite."""
+    CLOCK = "clock"
+    """A message was received before it was sent, by more than the bounds of the clocks explain."""
+    SETPOINTS = "set-points"
+    """Sensor and controller took the change of the set-point at different times."""
+    ROUNDING = "rounding"
+    """The threshold is below the rounding error of x at the set-point."""
+    LOSSES = "losses"
+    """Losses beyond the guarantee."""
+    WATCHDOG = "watchdog"
+    """The watchdog replaced the input."""
+    SAFE_INPUT = "safe input"
+    """The controller had no state and sent its safe input."""
+    ACKNOWLEDGED = "acknowledged"
+    """x_s is reset when an update is acknowledged."""
+    IDEAL_LOOP = "ideal loop"
+    """The claim assumes a loop that is not sampled, without delays."""
 
 
 NO_BOUND = "none"
@@ -244,8 +355,11 @@ class Claim(SummaryPart):
     """Largest share of the bound that was reached; at most 1 if the claim held."""
     verdict: Annotated[ClaimVerdict, Field(strict=False)]
     since_s: Real
-    """Time from which the claim was violated, void or not applicable."""
-    why: str
+    """Time from which the claim was violated, ended or not applicable."""
+    cause: Annotated[ClaimCause | None, Field(strict=False)] = None
+    """Why it ended, was not checked or is not applicable."""
+    detail: str = ""
+    """The process, the rule or the reason that the cause is about."""
     until_s: Real
     """The claim ends here, at the first change of a setting on which it depends; None: at the end of
     the run."""
@@ -269,7 +383,7 @@ class Claim(SummaryPart):
 
     @property
     def has_bound(self) -> bool:
-        """Whether there is a bound; else ``why`` is the reason for having none."""
+        """Whether there is a bound; else the cause says why there is none."""
         return self.bound != NO_BOUND
 
     @property
@@ -296,7 +410,7 @@ class Claim(SummaryPart):
 
 
 class ConditionsPart(SummaryPart):
-    """Largest observed values of the certificates' conditions."""
+    """The longest loss burst, and the largest times of the loop that occurred."""
 
     dropouts: Real
     sampling_s: Real
@@ -308,7 +422,7 @@ class ConditionsPart(SummaryPart):
 
 
 class AllowedConditionsPart(SummaryPart):
-    """Times that are allowed, or that a certificate covers, as in :class:`ConditionsPart`."""
+    """Times that are allowed, or that a proof covers, as in :class:`ConditionsPart`."""
 
     sampling_s: float
     delay_s: float
@@ -376,8 +490,8 @@ class LoopSummary(SummaryPart):
     acknowledgements: FlowPart | None = None
     actuations: FlowPart | None = None
     """Only if they cross the network."""
-    assumption_violations: list[ViolationPart]
-    assumptions: list[AssumptionPart]
+    violations: list[ViolationPart]
+    """What processes reported while the run went on."""
     uneven_periods: list[str] = []
     """What differs from the scenario's periods since they do not divide each other."""
     changes: list[ChangePart]
@@ -416,6 +530,8 @@ class LoopSummary(SummaryPart):
     """The schedule that the scenario allows; None where there are no certificates."""
     certified_for: AllowedConditionsPart | None = None
     """The schedule that the certificates cover, if the run was later than its scenario allows."""
+    conformance: list[ConformancePart] = []
+    """For each certificate: whether the run is one of its loop document."""
     claims: list[Claim] = []
     judged_until_s: Real = None
     exit: ExitPart

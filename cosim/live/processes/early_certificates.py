@@ -19,16 +19,16 @@ from cosim.record.run_directory import RunEnding
 from noack.core.system_processes import be_idle
 
 if TYPE_CHECKING:
-    from cosim.analysis.claims.run_certificates import Expectations
+    from cosim.analysis.claims.run_certificates import RunCertificate
 
 _POLL_S = 0.05
 
 
 class EarlyCertificates:
-    """Computes the expectations of a run's loops; a context manager, at whose end the process ends."""
+    """Computes the certificates of a run's loops; a context manager, at whose end the process ends."""
 
     def __init__(self) -> None:
-        self.known: dict[int, Expectations] = {}
+        self.known: dict[int, list[RunCertificate] | None] = {}
         """What is computed, by the number of the loop; complete when the context has ended."""
         self._ended = Event()
         self._process: BaseProcess | None = None
@@ -54,27 +54,27 @@ class EarlyCertificates:
             self._thread.join()
 
     def _receive(self, receiver: Connection) -> None:
-        by_key: dict[str, Expectations] = {}
+        by_key: dict[str, list[RunCertificate]] = {}
         with suppress(EOFError, OSError), receiver:  # the process has ended
             while not self._ended.is_set():
                 if receiver.poll(_POLL_S):
                     key, found = receiver.recv()
                     if found is not None:
                         by_key[key] = found
-                    self.known[len(self.known)] = by_key[key]
+                    self.known[len(self.known)] = by_key.get(key)
 
 
 def _compute(run_dir: Path, sender: Connection) -> None:
-    """Send what to expect of each loop in turn: its key, and the expectations at their first time."""
+    """Send the certificates of each loop in turn: its key, and the certificates at their first time."""
     be_idle()
-    from cosim.analysis.claims.run_certificates import expectations, expectations_key
+    from cosim.analysis.claims.run_certificates import certificates_key, expected_certificates
     from cosim.record.run_record import resolved_run
 
     loops = resolved_run(run_dir).loops
     sent = set[str]()
     for loop in loops:
-        key = expectations_key(loop)
-        sender.send((key, None if key in sent else expectations(loop, len(loops))))
+        key = certificates_key(loop)
+        sender.send((key, None if key in sent else expected_certificates(loop, len(loops))))
         sent.add(key)
 
 
@@ -82,5 +82,5 @@ def _compute(run_dir: Path, sender: Connection) -> None:
 class LaunchedEnding(RunEnding):
     """How a launched run ended."""
 
-    expectations: Mapping[int, "Expectations"] = field(default_factory=dict)
+    certificates: Mapping[int, "list[RunCertificate] | None"] = field(default_factory=dict)
     """What is known already of its loops, by their numbers."""

@@ -203,7 +203,9 @@ class LoopFeed:
         """The run's certificate; None if there is none. Computed at first use, since it is slow."""
         if not self._is_certified or self._loop.reference is not None or self._loop.loads:
             return None  # with a reference or loads, it bounds the deviations from it
-        certificate = run_certificates.scheduled_certificates(self._scenario)[0]  # without a search
+        certificate = run_certificates.scheduled_certificates(self._scenario)[
+            0
+        ].certificate  # without a search
         if certificate.inter_event_s is not None:
             self._view.add_certified_interval(certificate.inter_event_s, self._scenario.timing.horizon_ns)
         return certificate

@@ -5,8 +5,8 @@
 1. ``conditions.py`` derives from a scenario what a certificate assumes: the number of consecutive losses, the
    times h between tests, d until an update acts, σ, the age of inputs, and that of the first input. It says
    how likely a run keeps a guarantee on the losses that nothing enforces.
-2. ``assumptions.py`` lists every assumption of the paper and of the certificate, with a verdict. A run that
-   violates a condition voids the claims from that time on.
+2. ``assumptions.py`` lists every assumption of the paper and of the certificate about a scenario, with a
+   verdict.
 3. ``plant_equations.py`` has the equations of a plant that is not linear, for the checker to enclose.
 4. ``proven_bounds.py`` has what the checker has proven, as numbers: each bound is D₁e^{−rt} + D₂.
 5. ``certified_bounds.py``: a certificate, which is what was proven, or the reason why nothing was, with the

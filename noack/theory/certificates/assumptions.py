@@ -1,7 +1,7 @@
 """Assumptions of the paper and of a certificate, checked for one scenario before it runs.
 
-A claim holds only under its assumptions. Each assumption has a status, with the reason.
-Assumptions about the run itself (delays, the longest loss burst) are checked against its record.
+Each assumption has a status, with the reason. What a run has to do for a bound to hold of it is in the loop
+document, with which the run is compared (:mod:`cosim.analysis.conformance`).
 """
 
 import math
@@ -22,8 +22,6 @@ from noack.theory.certificates.normal_values import normal_limit
 _OF_THEOREM_2, _OF_CERTIFICATES = "Theorem 2", "certificates"
 _NOT_COVERED = "not covered by the theorems and the certificates"
 _NOT_BY_THEOREMS = "not covered by the theorems"
-LINEAR_PLANT = "the plant is ẋ = Ax + Bu"
-"""What the paper assumes of a plant; a certificate of a plant's equations does not."""
 
 
 class AssumptionStatus(StrEnum):
@@ -122,7 +120,7 @@ def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     )
     why = f"largest real part of an eigenvalue: {nominal:.3g} /s (Â + B̂K){_with_other_sign(loop)}"
     return [
-        _violated(LINEAR_PLANT, "eq:plant", kind),
+        _violated("the plant is ẋ = Ax + Bu", "eq:plant", kind),
         _checked("the gain stabilises the model", _OF_THEOREM_2, nominal < 0, why),
     ]
 

@@ -14,13 +14,13 @@ GOOD: dict[str, Any] = {
     "missing_samples": 0,
     "unintended_losses": 0,
     "rejected_datagrams": {},
-    "assumption_violations": [],
+    "violations": [],
     "longest_loss_burst": 3,
     "replay": {"bit_exact": True, "complete": True, "inputs": 7},
     "claims": [
         {"verdict": "held", "what": "a", "source": "b"},
         {"verdict": "not applicable", "what": "a", "source": "b"},
-        {"verdict": "void", "what": "a", "source": "b"},
+        {"verdict": "ended", "what": "a", "source": "b"},
     ],
 }
 
@@ -44,7 +44,7 @@ def test_stale_rejections_must_equal_the_packets_delivered_out_of_order() -> Non
         ({"missing_samples": 3}, "missing samples"),
         ({"unintended_losses": 1}, "unintended losses"),
         ({"rejected_datagrams": {"plant": {"tag": 1}}}, "rejected datagrams"),
-        ({"assumption_violations": [{"cause": "dropouts"}]}, "loss bursts beyond the guarantee"),
+        ({"violations": [{"cause": "dropouts"}]}, "loss bursts beyond the guarantee"),
         ({"replay": {"bit_exact": False, "complete": True}}, "replayed bit for bit and completely"),
         ({"replay": {"bit_exact": True, "complete": False}}, "replayed bit for bit and completely"),
         ({"replay": None}, "replayed bit for bit and completely"),

@@ -49,7 +49,7 @@ def results(record: RunRecord) -> dict[str, Any]:
         "summary": summarise_loop(record, 0, "horizon").model_dump(mode="json"),
         "replay": replay(record).to_json(),
         "claims": [claim.model_dump(mode="json") for claim in claims.evaluate()],
-        "violations": claims.violations(),
+        "conformance": [part.model_dump(mode="json") for part in claims.conformance()],
         "conditions": claims.largest_observed,
         "envelopes": [
             (curve.label, curve.t_s.tobytes(), curve.values.tobytes()) for curve in claims.envelopes()

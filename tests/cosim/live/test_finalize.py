@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import cosim.live.finalize
-from cosim.analysis.claims.run_certificates import Expectations, expectations
+from cosim.analysis.claims.run_certificates import RunCertificate, expected_certificates
 from cosim.analysis.summary.summary_model import RunSummary
 from cosim.live.finalize import finalize, reopen
 from cosim.live.processes.early_certificates import LaunchedEnding
@@ -277,19 +277,19 @@ def test_certificates_that_are_known_at_the_end_are_used(
     """Those of other loops are computed; here no other process is asked."""
     run = load_run(many_loops)
     known = {
-        record.number: expectations(record.scenario, len(run.names))
+        record.number: expected_certificates(record.scenario, len(run.names))
         for record in run.loops
         if record.number != 1
     }
     computed = []
 
-    def recorded_expectations(scenario: Scenario, loops: int) -> Expectations:
+    def recorded(scenario: Scenario, loops: int) -> list[RunCertificate] | None:
         computed.append(scenario.name)
-        return expectations(scenario, loops)
+        return expected_certificates(scenario, loops)
 
     monkeypatch.setattr(cosim.live.finalize, "cores", lambda: 1)
-    monkeypatch.setattr(cosim.live.finalize, "expectations", recorded_expectations)
-    ending = LaunchedEnding(many_loops, 0, ExitStatus.OK, "horizon", expectations=known)
+    monkeypatch.setattr(cosim.live.finalize, "expected_certificates", recorded)
+    ending = LaunchedEnding(many_loops, 0, ExitStatus.OK, "horizon", certificates=known)
     _, expected = judged_alone
     assert finalize(ending, report=False, view=False).summary == expected
     assert computed == [run.names[1]]

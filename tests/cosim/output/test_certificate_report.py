@@ -139,7 +139,7 @@ def test_a_plant_outside_its_box_is_named() -> None:
     assert message == ("the plant lies outside: A[2, 1] is 2 from the model's, the half-width is 0.3")
     claims = [c for c in RunClaims(simulate(outside)).evaluate() if c.source == "box certificate"]
     assert claims
-    assert {(c.verdict, c.since_s) for c in claims} == {("void", 0.0)}
+    assert {(c.verdict, c.since_s) for c in claims} == {("ended", 0.0)}
 
 
 def test_a_set_point_is_certified_in_its_own_coordinates() -> None:

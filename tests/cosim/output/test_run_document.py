@@ -55,21 +55,21 @@ def test_reasons_of_several_loops_that_differ_only_in_numbers_are_one_line(tmp_p
     )
     reasons = ["an input was old", "gain 1.5, not below 1", "gain 2.25, not below 1", "gain 1.5, not below 1"]
     loops = [
-        loop.model_copy(update={"claims": [Claim(**claim("void", why=why))]})
+        loop.model_copy(update={"claims": [Claim(**claim("unchecked", cause="no certificate", detail=why))]})
         for loop, why in zip(outcome.summary.loops, reasons, strict=True)
     ]
     summary = outcome.summary.model_copy(update={"loops": loops})
     print_document(Console(file=(file := io.StringIO())), run_document(replace(outcome, summary=summary)))
-    assert [line for line in file.getvalue().splitlines() if line.startswith("void: ")] == [
-        "void: gain 1.5 to 2.25, not below 1 (3 loops)",
-        f"void: an input was old ({loops[0].name})",
+    assert [line for line in file.getvalue().splitlines() if line.startswith("claims ended or")] == [
+        "claims ended or unchecked: no certificate: gain 1.5 to 2.25, not below 1 (3 loops)",
+        f"claims ended or unchecked: no certificate: an input was old ({loops[0].name})",
     ]
 
 
 def test_a_broken_guarantee_is_shown_as_an_error(outcome: Outcome) -> None:
     lost = {"t_s": 2.5, "process": "controller", "cause": "dropouts", "what": "MANSD violated: 6 lost"}
     later_violations = [lost | {"what": f"MANSD violated: {n} lost"} for n in range(7, 13)]
-    text = printed(outcome, assumption_violations=[lost, *later_violations])
-    assert text.count("assumption violated from t = 2.500 s on (reported by controller): MANSD") == 5
-    assert "1 more violation of an assumption" in text
+    text = printed(outcome, violations=[lost, *later_violations])
+    assert text.count("controller reported at 2.500 s: MANSD") == 5
+    assert "1 more report of this kind" in text
     assert RED in text

@@ -75,7 +75,7 @@ def test_the_controller_reports_a_violated_assumption(busy_content: dict[str, An
     assert {notice["level"] for notice in record.notices} == {"violation"}
     deliveries = record[CONTROLLER_DELIVERY]
     long_gaps = deliveries[deliveries["dropouts"] > 0]
-    violations = summarise_loop(record, 0, "horizon").to_json()["assumption_violations"]
+    violations = summarise_loop(record, 0, "horizon").to_json()["violations"]
     assert len(violations) == len(long_gaps) > 0
     for violation, gap in zip(violations, long_gaps, strict=True):
         assert violation["t_s"] == pytest.approx(gap["t_ns"] * 1e-9)

@@ -56,7 +56,7 @@ def test_a_plant_by_its_equations_is_the_papers_loop_and_not_linear() -> None:
 def test_changes_are_refused_before_a_run_and_not_in_it() -> None:
     with pytest.raises(CallerError, match=r"^changes: .*leave changes out"):
         certificates_of(shipped("double_integrator", CHANGES))
-    assert scheduled_certificates(resolved("double_integrator", CHANGES))[0].exists
+    assert scheduled_certificates(resolved("double_integrator", CHANGES))[0].certificate.exists
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_changes_are_refused_before_a_run_and_not_in_it() -> None:
 )
 def test_what_the_checkers_table_calls_irrelevant_changes_no_certificate(settings: tuple[str, ...]) -> None:
     before, after = (
-        [each.to_json() for each in scheduled_certificates(resolved("double_integrator", *given))]
+        [each.certificate.to_json() for each in scheduled_certificates(resolved("double_integrator", *given))]
         for given in ((SINE,), (SINE, *settings))
     )
     assert before == after

@@ -7,7 +7,9 @@ import pytest
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.claims.run_certificates import RUN_WORK, scheduled_certificates
-from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
+from cosim.analysis.conformance.run_conformance import conformance
+from cosim.analysis.conformance.verdicts import Failed
+from cosim.analysis.summary.summary_model import Claim, ClaimCause, ClaimVerdict
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
@@ -62,31 +64,33 @@ def test_inputs_of_later_times_exceed_a_bound_that_does_not_cover_them_and_anoth
     late = worst_lateness(4005, 3.7)
     record = late_run(late.__getitem__, "horizon_s=8.0", "trigger.alpha_per_s=3.7")
     claims = RunClaims(record)
-    (violation,) = claims.violations()
-    assert (violation.cause, violation.t_s, violation.worst) == ("lead", 0.0, pytest.approx(0.007))
-    assert violation.text == (
-        "the applied input was computed for a time up to 0.007 s after its step, 0 s allowed"
-    )
     observed = claims.largest_observed
     assert observed["hold_s"] == pytest.approx(0.003)
     assert observed["lead_s"] == pytest.approx(0.007)
     # The bound of the schedule, which has no such inputs, is exceeded; that of the run's lead is not.
-    (schedule,) = scheduled_certificates(record.scenario, RUN_WORK)
+    ((schedule, document, _),) = scheduled_certificates(record.scenario, RUN_WORK)
     t_s, x = record[PLANT_STEP]["t_ns"] * 1e-9, np.abs(record[PLANT_STEP]["x"][:, 0])
     assert (x > 1.5 * schedule.state(t_s)).any()
+    assert document is not None
+    failure = conformance(record, document).failure
+    assert failure is not None
+    assert (failure.kind, failure.t_s) == (Failed.INPUT, 0.0)
     assert claims.certified_for is not None
     assert claims.certified_for.lead_s == pytest.approx(0.007)
     assert {claim.verdict for claim in certified(claims)} == {ClaimVerdict.HELD}
 
 
-def test_claims_are_void_from_the_first_such_input_on_if_no_bound_covers_it() -> None:
+def test_claims_end_at_the_first_such_input_if_no_bound_covers_it() -> None:
     """A step that is 0.2 s late: no certificate covers such ages, and none of the steps before."""
     record = late_run(lambda step: 100 if step == 500 else 0, "horizon_s=2.0")
     claims = RunClaims(record)
     assert claims.certified_for is None
     for claim in certified(claims):
-        assert claim.verdict == ClaimVerdict.VOID
-    assert "lead" in {violation.cause for violation in claims.violations()}
+        assert (claim.verdict, claim.cause) == (ClaimVerdict.ENDED, ClaimCause.CONFORMANCE)
+        assert claim.since_s == pytest.approx(1.0, abs=0.01)
+    (part,) = claims.conformance()
+    assert part.failure is not None
+    assert part.failure.kind in {Failed.INPUT, Failed.LIMIT}
 
 
 def test_no_schedule_has_inputs_of_later_times() -> None:
@@ -95,4 +99,4 @@ def test_no_schedule_has_inputs_of_later_times() -> None:
     assert allowed_conditions(resolved).lead_s == 0.0
     claims = RunClaims(late_run(lambda step: 0, "horizon_s=1.0"))
     assert claims.largest_observed["lead_s"] == 0.0
-    assert claims.violations() == []
+    assert [part.failure for part in claims.conformance()] == [None]

@@ -1,13 +1,8 @@
 """The paper's statements are checked in a run where its scenario asks for them, and only there."""
 
-import pytest
-
 from cosim.analysis.claims.claim_catalogue import CERTIFIED_AND_IDENTITY, PAPER, claims_about
-from cosim.output.run_verdict import remarks
-from cosim.simulation.virtual_time import simulate
 from noack.theory.certificates.assumptions import assumptions
 from tests.helpers.shipped import resolved
-from tests.helpers.summaries import summary_of
 
 PERIODIC = "trigger={policy='periodic', period_s=0.01}"
 
@@ -24,11 +19,3 @@ def test_the_papers_scenario_has_the_papers_statements_too() -> None:
     assert scenario.certificate.paper
     assert claims_about(scenario) == (*CERTIFIED_AND_IDENTITY, *PAPER)
     assert {"Theorem 2", "Section II", "Section III"} <= {each.source for each in assumptions(scenario)}
-
-
-@pytest.mark.parametrize("asks", ["false", "true"])
-def test_a_loop_with_another_trigger_violates_the_papers_assumptions_only_if_asked(asks: str) -> None:
-    scenario = resolved("double_integrator", PERIODIC, "horizon_s=1", f"certificate.paper={asks}")
-    record = simulate(scenario)
-    lines = [line.text for line in remarks(summary_of(record))]
-    assert any("eq:thre" in line for line in lines) == (asks == "true"), lines

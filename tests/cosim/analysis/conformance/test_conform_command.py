@@ -6,7 +6,15 @@ from pathlib import Path
 import pytest
 
 from cosim.analysis.conformance import run_conformance
-from cosim.analysis.conformance.conformance import Conformance
+from cosim.analysis.conformance.verdicts import (
+    Conformance,
+    EdgeKind,
+    Failed,
+    Failure,
+    Place,
+    Transition,
+    Unknown,
+)
 from noack.core.errors import ExitStatus
 from tests.helpers.command_line import invoke
 
@@ -49,11 +57,14 @@ def test_the_document_of_a_plant_given_by_equations_needs_no_option(tmp_path: Pa
 def test_a_run_that_is_refuted_is_an_exit_status_and_a_reason(
     runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refuted = Conformance(1.5, "'0 lost' lasts longer than 2 ms", {"sent": 3}, {"0 lost": 1.5}, "a loop")
+    unknown = Unknown(Transition("3 lost", EdgeKind.EVENT, Place(False, False, 4)), 3)
+    failure = Failure(1.5, Failed.EDGE, "3 lost", unknown=unknown)
+    refuted = Conformance("a loop", 1.5, failure, {"sent": 3}, {"0 lost": 1.5})
     monkeypatch.setattr(run_conformance, "conformance_of", lambda *_: refuted)
     result = invoke("conform", "--runs", runs / "unstable_pendulum")
     assert result.exit_code == ExitStatus.FAILED
-    assert "until 1.5 s only: '0 lost' lasts longer than 2 ms" in " ".join(result.output.split())
+    text = "until 1.5 s only: 4 packets were lost in a row, at most 3 are allowed"
+    assert text in " ".join(result.output.split())
 
 
 def test_a_run_without_a_document_is_refused_in_one_line(runs: Path) -> None:

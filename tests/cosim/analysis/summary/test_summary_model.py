@@ -32,7 +32,7 @@ DELETED = object()
 RENAMED = object()
 VALUES = [None, HUGE, "[/b]", [[[[]]]], {"a": [1]}, DELETED, RENAMED]
 PARTS = (
-    "changes", "watchdog", "estimation", "disturbances", "assumption_violations",
+    "changes", "watchdog", "estimation", "disturbances", "violations",
     "acknowledgements", "actuations", "lateness_us", "latency_us", "realtime", "replay",
     "conditions", "certified_for", "claims", "linearisation", "ideal_loop", "outputs",
 )  # fmt: skip

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.observed_conditions import SampledSeries
 from cosim.record.run_events import ActuationTimes
 from cosim.record.run_record import RunRecord
 from noack.core.row_operations import largest_sizes
@@ -19,8 +18,46 @@ from noack.protocol.record_tables import (
 from plant_server.plant import too_old
 
 Times = NDArray[np.int64]
+Reals = NDArray[np.float64]
+_TOLERANCE_S = 1e-9
+"""Times in seconds have rounding errors below this."""
 _NO_TICK = 2**63 - 1
 """Stands for the number of a tick that does not exist; all others are smaller."""
+
+
+class Excess(NamedTuple):
+    """How far a series exceeded a limit."""
+
+    first_s: float
+    """The first time above it."""
+    worst: float
+    """The largest value."""
+    worst_at_s: float
+    """The time of the largest value."""
+
+
+class SampledSeries(NamedTuple):
+    """A condition's value over time: k values, each determined at its time."""
+
+    t_s: Reals
+    value: Reals
+
+    def largest(self) -> float | None:
+        """The largest value; None if there is none."""
+        return float(self.value.max()) if len(self.value) else None
+
+    def excess(self, limit: float) -> Excess | None:
+        """Return how far the values exceed a limit; None if they keep it."""
+        beyond = np.flatnonzero(self.value > limit + _TOLERANCE_S)
+        if not len(beyond):
+            return None
+        largest = int(beyond[self.value[beyond].argmax()])
+        return Excess(float(self.t_s[beyond[0]]), float(self.value[largest]), float(self.t_s[largest]))
+
+    def before(self, t_s: float) -> "SampledSeries":
+        """Return the values before a time."""
+        early = self.t_s < t_s
+        return SampledSeries(self.t_s[early], self.value[early])
 
 
 class AppliedUpdate(NamedTuple):
@@ -48,6 +85,12 @@ class PlantInputs(NamedTuple):
     """Time of the first input of a controller with a state; infinite if there was none."""
     updates: list[AppliedUpdate]
     """In the order in which they were received."""
+    actuation: Times
+    """Newest actuation of each step, (k,); ``NO_SEQUENCE`` before the first one."""
+    input_ns: Times
+    """Time for which the controller computed the input of each step, (k,)."""
+    is_controlled: NDArray[np.bool_]
+    """Whether the input of each step comes from a controller with a state, (k,)."""
 
 
 def plant_inputs(record: RunRecord) -> PlantInputs:
@@ -87,6 +130,9 @@ def plant_inputs(record: RunRecord) -> PlantInputs:
         safe_input=SampledSeries(step_s[safe], sizes[safe]),
         start_s=float(step_s[np.argmax(controlled)]) if controlled.any() else np.inf,
         updates=[*map(AppliedUpdate, sequence.tolist(), model_ns.tolist(), applied_ns)],
+        actuation=newest,
+        input_ns=input_ns,
+        is_controlled=is_held,
     )
 
 
