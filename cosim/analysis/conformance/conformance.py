@@ -342,7 +342,8 @@ class _Checked:
     def edge_counts(self) -> dict[str, int]:
         """Return how often each edge was taken."""
         taken = np.bincount(self._trace.items[~self._is_motion], minlength=len(self._trace.names))
-        return {name: int(taken[self._number[name]]) if name in self._number else 0 for name in self._edges}
+        names = [name for name, edge in self._edges.items() if edge["to"] is not None]
+        return {name: int(taken[self._number[name]]) if name in self._number else 0 for name in names}
 
     def clock_shares(self) -> dict[str, float]:
         """Return the largest share of each clock's limit."""

@@ -78,6 +78,8 @@ def document_of_statement(statement: WitnessedStatement, naming: Naming) -> RunD
     loop, found = statement.loop, statement.document
     if loop is None or found is None:
         raise NoDocumentError(statement.reason)
+    if loop.rule.memory is not None:
+        raise NoDocumentError("the variable of a dynamic rule is not recorded, so no run is compared")
     if found.get("bounds"):
         return run_document(document_of(loop, found, naming))
     rate = read_number(found, "rate")
@@ -86,7 +88,7 @@ def document_of_statement(statement: WitnessedStatement, naming: Naming) -> RunD
         later = at_start = min(later, _FEW_LATER)
     noise = noise_of(loop, rate)
     by_tests = loop.needs_tests_apart
-    assumed = Assumptions(None, later, at_start, None, noise=noise, by_tests=by_tests)
+    assumed = Assumptions(None, later, at_start, noise=noise, by_tests=by_tests)
     try:
         return run_document(LoopDocument(loop, rate, assumed, (), naming))
     except ValueError as error:  # it would have too many locations
