@@ -178,7 +178,7 @@ class _Noise:
         names, C = document.noise_columns()
         G = np.abs(C.T @ C)
         sizes = [as_written(float(size) * _ROOM) for size in G.sum(axis=1)]
-        self._sizes = dict(zip(names, sizes, strict=True))
+        self._sizes = {name: size for name, size in zip(names, sizes, strict=True) if size > 0}
         self._units = {name: document.facts[f"noise {name}"]["more"][0] for name in names}
 
     @property
@@ -197,7 +197,7 @@ class _Noise:
     def needed(self, unit: str, share: float) -> float:
         """Return what the noise of the event's own measurement takes of a unit."""
         numbers = self.at_event(share)
-        return sum(float(numbers[f"noise {name}"]) for name, of in self._units.items() if of == unit)
+        return sum(float(numbers[f"noise {name}"]) for name in self._sizes if self._units[name] == unit)
 
     def at_event(self, share: float) -> dict[str, Fraction]:
         """Return multipliers k with |a|² − s |a − b|² + Σ k p² ⪰ 0 for b = WCp and a share s < 1."""
@@ -212,6 +212,6 @@ def levels_of(bounds: Sequence[Mapping[str, Any]]) -> dict[str, Levels]:
     found = {}
     for bound in bounds:
         if bound.get("from_start", True):
-            squares = [bound["numbers"].get(f"level {k}", 0.0) for k in (1, 2)]
+            squares = [max(bound["numbers"].get(f"level {k}", 0.0), 0.0) for k in (1, 2)]
             found[str(bound["output"])] = math.sqrt(squares[0]), math.sqrt(squares[1])
     return found

@@ -78,7 +78,7 @@ class _Bound:
                 "times": quotient(self._size(index, node, name.removeprefix("P/"))),
             }
         for name, _ in form.scalars:
-            number, kind = as_written(self._numbers[name]), name.split("/")[0]
+            number, kind = as_written(self._numbers.get(name, 0.0)), name.split("/")[0]
             if kind in ("c1", "c2"):
                 size = self._size(index, node, name.removeprefix(f"{kind}/"))
                 yield {"square": f"f{kind[1]}", "times": quotient(-number * size)}
@@ -156,7 +156,7 @@ class _Bound:
             else Fraction(numbers[fact])
         )
         for name in names:
-            total += as_written(self._numbers[f"eta/{name}"]) * self._size(target, node, name)
+            total += as_written(self._numbers.get(f"eta/{name}", 0.0)) * self._size(target, node, name)
         numbers[fact] = quotient(total)
 
     def _of_silent_edges(self) -> None:

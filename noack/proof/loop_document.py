@@ -127,7 +127,10 @@ class LoopDocument:
         if loop.rule.integrates:
             raise NoDocumentError("a rule that integrates has no loop document")
         self.loop, self.rate, self._assumed, self.naming = loop, rate, assumed, naming
-        self.model = Model(loop, rate, arb(0), assumed.errors, assumed.noise, **assumed.of_model)
+        try:
+            self.model = Model(loop, rate, arb(0), assumed.errors, assumed.noise, **assumed.of_model)
+        except ValueError as error:  # it is too large
+            raise NoDocumentError(str(error)) from None
         self._noise = {*self.model.sources, *self._next_memory}
         """Coordinates that have no motion."""
         used = {c for place in self.model.locations for c in place.coordinates} | self._noise

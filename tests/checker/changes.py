@@ -39,7 +39,7 @@ def _number_of(document: Document, rng: Rng, start: str = "") -> tuple[Document,
 
 def _scaled_number(document: Document, rng: Rng, start: str, factor: float) -> None:
     numbers, name = _number_of(document, rng, start)
-    numbers[name] *= factor
+    numbers[name] *= float(factor)
 
 
 def _other_digit(document: Document, rng: Rng) -> None:
@@ -87,7 +87,7 @@ def _another_label(document: Document, rng: Rng) -> None:
 
 def _scaled_entry(document: Document, rng: Rng) -> None:
     """Change all forms by one factor, but not the levels."""
-    entry, factor = _entry(document, rng), rng.choice([0.9, 1.1])
+    entry, factor = _entry(document, rng), float(rng.choice([0.9, 1.1]))
     entry["matrices"] = {name: (factor * np.array(M)).tolist() for name, M in entry["matrices"].items()}
     for name in entry["numbers"]:
         if not name.startswith("level"):
@@ -96,11 +96,17 @@ def _scaled_entry(document: Document, rng: Rng) -> None:
 
 def _scaled(key: str, factor: float) -> Callable[[Document, Rng], None]:
     def change(document: Document, rng: Rng) -> None:
-        tables = [document, _entry(document, rng), document.get("chain", {}), document.get("errors", {})]
+        tables = [document, _entry(document, rng)]
         table = next((each for each in tables if key in each), document)
         table[key] = table.get(key, 1.0) * factor
 
     return change
+
+
+def _scale_errors(document: Document, factor: float) -> None:
+    """Change what is assumed of the errors, if anything is."""
+    if "errors" in document:
+        document["errors"] = {unit: factor * size for unit, size in document["errors"].items()}
 
 
 DOCUMENTS: dict[str, Callable[[Document, Rng], object]] = {
@@ -127,11 +133,8 @@ DOCUMENTS: dict[str, Callable[[Document, Rng], object]] = {
     "inter-event time + 5 %": _scaled("inter_event_s", 1.05),
     "inter-event time x 2": _scaled("inter_event_s", 2.0),
     "inter-event time - 5 %": _scaled("inter_event_s", 0.95),
-    "first event x 2": _scaled("first_event_s", 2.0),
-    "gain of the chain - 1 %": _scaled("gain", 0.99),
-    "gain of the chain + 1 %": _scaled("gain", 1.01),
-    "errors - 5 %": _scaled("decaying", 0.95),
-    "errors + 5 %": _scaled("decaying", 1.05),
+    "errors - 5 %": lambda d, rng: _scale_errors(d, 0.95),
+    "errors + 5 %": lambda d, rng: _scale_errors(d, 1.05),
     "one later event more": lambda d, rng: d.update(later=d["later"] + 1),
     "one later event less": lambda d, rng: d.update(later=max(d["later"] - 1, 0)),
     "another number of pieces": lambda d, rng: d.update(pieces=int(rng.integers(1, 9))),

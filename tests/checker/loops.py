@@ -121,13 +121,8 @@ def until_due() -> Loop:
     return changed(loop, due=fmpq(1, 50))
 
 
-# With facts about errors of an assumed size.
-
-ASSUMED: dict[str, Loop] = {
-    "holds": double_integrator(floor=0.02, level=0.0)._replace(holds=True),
-    "holds_decaying": double_integrator(floor=0.01)._replace(holds=True),
-    "deadline": with_rule(double_integrator(floor=0.01), always=True),
-}
+HOLDS = double_integrator(floor=0.02, level=0.0)._replace(holds=True)
+"""A loop that holds its input, under a schedule."""
 
 
 # With an observer.

@@ -2,22 +2,19 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
-from flint import arb, fmpq
-from noack_check.__main__ import check_file
 
 from cosim.analysis.witnesses import resolved_content
 from cosim.simulation.virtual_time import simulate
+from noack.proof.files import document_of
+from noack.proof.loop_document import Naming
 from noack.proof.statement_proof import prove_statement
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
-from noack_check.balls import frobenius
 from noack_check.check import RejectedError
-from noack_check.document import read_number
 from noack_check.keys import RefusedError
-from noack_check.proof import Bound, conclude, error_without_input, prove_bound, read_assumptions
 from noack_check.scenario import read_loop
-from noack_check.sentences import meaning
 from tests.checker.completed import completed
 from tests.checker.proofs import Proved, proved
 from tests.checker.runs import floats
@@ -69,12 +66,31 @@ def test_a_loop_with_a_reference_is_read_about_its_rest_and_the_reference() -> N
     assert loop.until is None  # it is a set-point
 
 
-def test_what_the_load_pushes_before_the_first_input_moves_the_sensors_error() -> None:
-    loop, time = read_loop(motor(), box=False, ideal=False), fmpq(1, 100)
-    assert loop.push_before_input is not None
-    at_rest = error_without_input(loop._replace(push_before_input=None), time)
-    moved = frobenius(loop.weight * loop.push_before_input) * arb(time)
-    assert 0.8 * moved < error_without_input(loop, time) - at_rest < 1.2 * moved
+def test_what_the_load_pushes_before_the_first_input_moves_the_state_and_the_sensors_error(
+    statement: Proved,
+) -> None:
+    corners = []
+    for loop in (statement.loop, statement.loop._replace(push_before_input=None)):
+        table = document_of(loop, statement.document, Naming("a motor")).table
+        names = [coordinate["name"] for coordinate in table["coordinates"]]
+        corners += table["motions"]["without input"]
+    with_load, at_rest = corners
+    (push,) = with_load["unknown"]
+    assert at_rest["unknown"] == []
+    moved = {
+        name: float(np.mean(entry)) for name, (entry,) in zip(names, push["column"], strict=True) if entry
+    }
+    size = float(push["rows"][0][names.index("f2")])
+    assert {name: size * entry for name, entry in moved.items()} == {
+        "x1": pytest.approx(309.75 * 0.2), "e x1": pytest.approx(-309.75 * 0.2),
+    }  # fmt: skip
+
+
+def test_a_larger_push_before_the_first_input_is_not_covered(statement: Proved) -> None:
+    push = statement.loop.push_before_input
+    assert push is not None
+    with pytest.raises(RejectedError, match="all states: not proven at motion/start, 0 later/"):
+        prove_statement(statement.loop._replace(push_before_input=3 * push), statement.document)
 
 
 def test_a_load_that_changes_is_refused() -> None:
@@ -128,22 +144,9 @@ def test_the_shaft_has_a_proven_bound(statement: Proved) -> None:
 
 def test_the_input_is_no_output_of_a_loop_about_its_rest(statement: Proved) -> None:
     """It is not 0 at rest, nor what the forms have before the first one acts."""
-    loop, document = read_loop(motor(), box=False, ideal=False), statement.document
-    rate = read_number(document, "rate")
-    assumed, entries = read_assumptions(loop, rate, document), document["bounds"]
-    bounds = [prove_bound(loop, rate, entry, assumed) for entry in entries]
-    assert conclude(loop, document, assumed, bounds).bounds
+    (first, *_), document = statement.document["bounds"], statement.document
     with pytest.raises(RejectedError, match=r"^u: about a reference, or where the loop rests"):
-        conclude(loop, document, assumed, [*bounds, Bound("u[0]", arb(1), arb(0), from_start=True)])
-
-
-def test_the_sentences_say_from_where_they_count(statement: Proved) -> None:
-    lines = [*check_file({"scenario": motor(), "statements": [statement.document]}, None)]
-    assert any("where the loop rests under its constant loads" in line for line in lines)
-    loop = read_loop(resolved_tables("double_integrator"), box=False, ideal=False)
-    assert meaning(resolved_tables("double_integrator"), loop) == ""
-    tables = resolved_tables("double_integrator", "controller.setpoint=[0.5,0.0]")
-    assert meaning(tables, loop) == "x and outputs count from the set-point"
+        prove_statement(statement.loop, {**document, "bounds": [{**first, "output": "u[0]"}]})
 
 
 def test_no_simulated_run_exceeds_it(statement: Proved) -> None:
@@ -160,7 +163,7 @@ def test_no_simulated_run_exceeds_it(statement: Proved) -> None:
 
 def test_the_bound_is_none_of_a_larger_load(statement: Proved) -> None:
     larger = read_loop(motor("plant.load=[2.0]"), box=False, ideal=False)
-    with pytest.raises(RejectedError, match=r"^x: flow/start, "):
+    with pytest.raises(RejectedError, match=r"at motion/start, "):
         prove_statement(larger, completed(larger, statement.document))
 
 
@@ -168,5 +171,5 @@ def test_the_bound_is_none_of_a_slower_observer(statement: Proved) -> None:
     tables = motor()
     tables["observer"]["gain"][2] = [entry / 10 for entry in tables["observer"]["gain"][2]]
     loop = read_loop(tables, box=False, ideal=False)
-    with pytest.raises(RejectedError, match=r"^x: edge/0 lost, "):
+    with pytest.raises(RejectedError, match=r"at edge/0 lost, "):
         prove_statement(loop, completed(loop, statement.document))

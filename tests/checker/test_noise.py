@@ -1,28 +1,29 @@
 """Bounded noise of measurements: what changes by it, and documents that leave it out somewhere."""
 
+import json
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from flint import arb, fmpq
 
-from noack.theory.witnesses.assumptions import first_event_s, inter_event_s
+from noack.proof.event_times import levels_of
+from noack.proof.files import proof_files
+from noack.proof.loop_document import Naming
+from noack.proof.statement_proof import prove_by_forms
+from noack.theory.witnesses.assumptions import inter_event_s
 from noack_check.balls import matrix, number, zeros
-from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
-from noack_check.model import Chain, Errors, Model
-from noack_check.norms import growth
-from noack_check.proof import (
-    Bound,
-    Proof,
-    _prove_quiet_start,
-    error_without_input,
-    prove,
-    share_of_errors,
-    weighted,
-)
+from noack_check.model import Errors, Model
+from noack_check.proof import Proof
 from noack_check.scenario import read_loop
+from noack_kernel import RejectedError as RejectedByKernelError
+from noack_kernel import prove
 from tests.checker.completed import completed
-from tests.checker.loops import IDEAL, NOISY, SCHEDULE, double_integrator, early, noisy
+from tests.checker.loops import IDEAL, NOISY, SCHEDULE, double_integrator, noisy, with_rule
 from tests.checker.proofs import Proved, proved
+from tests.checker.quiet_starts import is_quiet
 from tests.checker.rejections import failing, rejects
 from tests.checker.runs import exceeded, floats
 from tests.helpers.resolved_tables import resolved_tables
@@ -114,12 +115,12 @@ def test_all_tests_fail_with_more_noise(witness: Proved) -> None:
 def test_a_document_without_noise_proves_nothing_with_noise() -> None:
     loop = noisy(proved("without_noise").loop)
     document = completed(loop, proved("without_noise").document)
-    rejects(loop, document, "^x: edge/0 lost, sent/")
+    rejects(loop, document, "at edge/0 lost, sent/")
 
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_noise_of_one_state_needs_its_multiplier(index: int) -> None:
-    rejects(LOOP, completed(LOOP, proved(f"noisy_{index}").document), "^x: edge/0 lost, sent/")
+    rejects(LOOP, completed(LOOP, proved(f"noisy_{index}").document), "at edge/0 lost, sent/")
 
 
 def test_the_error_at_the_start_is_any_noise() -> None:
@@ -129,7 +130,7 @@ def test_the_error_at_the_start_is_any_noise() -> None:
     assert {name for name, _ in item.scalars if name.startswith("m/")} == {"m/start/0", "m/start/1"}
 
 
-# What follows from the drift.
+# Errors, and times between events.
 
 
 def test_the_sensor_error_between_tests_has_the_noise() -> None:
@@ -145,71 +146,74 @@ def test_the_sensor_error_between_tests_has_the_noise() -> None:
 
 
 def test_the_time_between_events_is_shorter_by_the_noise_of_two_measurements(witness: Proved) -> None:
+    """A document that names a longer time proves no longer one."""
     drift, rate = drift_of(witness.proof), witness.document["rate"]
     without = inter_event_s(LOOP._replace(noise=zeros(2, 0)), rate, drift)
-    assert without > 1.2 * witness.document["inter_event_s"]
-    rejects(LOOP, {**witness.document, "inter_event_s": without}, "^inter_event_s: an event may")
     once = inter_event_s(noisy(LOOP, SIZE / 2), rate, drift)
-    rejects(LOOP, {**witness.document, "inter_event_s": once}, "^inter_event_s: an event may")
+    assert without > once > 1.1 * witness.document["inter_event_s"]
+    for named in (without, once):
+        proof = prove_by_forms(LOOP, {**witness.document, "inter_event_s": named})
+        assert proof.inter_event == prove_by_forms(LOOP, witness.document).inter_event
+
+
+def claim_a_longer_time(entry: dict[str, Any], longer: float) -> None:
+    entry["apart"] = longer
+
+
+def begin_without_noise(entry: dict[str, Any], longer: float) -> None:
+    """As if x_s were x after an event."""
+    entry["after"] = [0, 0]
+
+
+def compare_without_noise(entry: dict[str, Any], longer: float) -> None:
+    """As if the rule compared x_s − x."""
+    for name, table in entry["multipliers"].items():
+        if name.startswith("edge/"):
+            table["facts"] = {fact: m for fact, m in table["facts"].items() if not fact.startswith("noise")}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (claim_a_longer_time, "times: the rows may reach more within the time"),
+        (begin_without_noise, "not proven at after/"),
+        (compare_without_noise, "not proven to be never taken|not proven at edge/"),
+    ],
+)
+def test_a_time_that_leaves_out_noise_is_rejected(
+    witness: Proved, change: Callable[[dict[str, Any], float], None], reason: str
+) -> None:
+    document = proof_files(LOOP, witness.document, Naming("noisy"))
+    proof = json.loads(document.proof)
+    (entry,) = (each for each in proof["times"] if "apart" in each)
+    drift = levels_of(witness.document["bounds"])["drift"]
+    longer = inter_event_s(noisy(LOOP, SIZE / 2), witness.document["rate"], drift)
+    change(entry, longer)
+    with pytest.raises(RejectedByKernelError, match=reason):
+        prove(document.document, json.dumps(proof))
 
 
 def test_without_a_floor_noise_makes_events_at_once() -> None:
     loop = noisy(double_integrator(level=0.05))
     assert inter_event_s(loop, 0.3, (0.1, 0.0)) == 0
     found = completed(loop, proved("double_integrator").document)
-    rejects(loop, found, "^x: edge/0 lost, sent/")
-
-
-def test_the_first_event_may_come_earlier_by_noise() -> None:
-    loop = early(0.05)
-    loop = loop._replace(rule=loop.rule._replace(floor=arb(0.03)))
-    found = proved("early_noisy")
-    without = first_event_s(loop, drift_of(found.proof), 2 * found.document["inter_event_s"])
-    assert without > found.document["first_event_s"]
-    rejects(noisy(loop), {**found.document, "first_event_s": without}, "^first_event_s: an event may")
+    rejects(loop, found, "at edge/0 lost, sent/")
 
 
 def test_a_start_is_quiet_up_to_the_noise_of_two_measurements() -> None:
+    """At 20 ms We is about (0, −0.0197) without noise, and 0.015 below the floor."""
     loop = double_integrator(SCHEDULE._replace(start=fmpq(3, 100)), level=0.0)
-    grown = error_without_input(loop, fmpq(2, 100))
-    for size, is_quiet in ((0.0, True), (0.004, True), (0.0055, False)):
-        rule = loop.rule._replace(floor=arb((grown + 0.015).mid()))
-        tried = noisy(loop._replace(rule=rule), size)
-        if is_quiet:
-            _prove_quiet_start(tried)
-        else:
-            with pytest.raises(RejectedError, match="an event may happen"):
-                _prove_quiet_start(tried)
+    loop = with_rule(loop, floor=number(0.0347))
+    for size, expected in ((0.0, True), (0.004, True), (0.005, True), (0.0065, False)):
+        largest = np.hypot(2 * size, 0.0197 + 2 * size)
+        assert (largest < 0.0347) == expected
+        assert is_quiet(noisy(loop, size)) == expected
 
 
-# What is assumed of the errors, and the chain.
-
-
-def test_the_chain_has_the_noise_of_each_missing_event(witness: Proved) -> None:
-    document = {key: value for key, value in witness.document.items() if key != "gains"}
-    bounds = {bound.output: bound for bound in prove(LOOP, document).bounds}
-    gain = witness.document["chain"]["gain"]
-    constant, size = float(bounds["e_s"].constant.mid()), SIZE * 2**0.5
-    recent = float(growth(weighted(LOOP, witness.proof.rate), arb(LOOP.times.delay))[0])
-    missing = 2 * gain + recent
-    by_chain = constant + missing * (constant + size)
-    assert float(bounds["e_c"].constant.mid()) == pytest.approx(by_chain)
-
-
-def test_errors_are_assumed_with_the_noise(witness: Proved) -> None:
-    sensor = {bound.output: bound for bound in witness.proof.bounds}["e_s"]
-    sizes = {name: float(getattr(sensor, name).mid()) for name in ("decaying", "constant")}
-    most = max(1.0, sizes["decaying"] / sizes["constant"])
-    with_noise = {name: size * 3 + most * SIZE * 2**0.5 for name, size in sizes.items()}
-    document = completed(LOOP, {**witness.document, "errors": sizes}, whole=True)
-    rejects(LOOP, document, "^errors: the sensor's error may exceed them")
-    decaying, constant = drift_of(witness.proof)
-    drift = Bound("drift", number(decaying), number(constant), True)
-    assumed = Errors(number(with_noise["decaying"]), number(with_noise["constant"]), Chain(arb(1), arb(1)))
-    loops = LOOP, LOOP._replace(noise=zeros(2, 0))
-    shares = [float(share_of_errors(loop, number(0.3), drift, assumed).mid()) for loop in loops]
-    # The noise twice: within e_s after a test, and at the next one.
-    assert shares[0] - shares[1] >= 2 * SIZE * 2**0.5 / with_noise["constant"]
+def test_errors_are_not_assumed_with_noise(witness: Proved) -> None:
+    errors = {"decaying": 1.0, "constant": 1.0}
+    document = completed(LOOP, {**witness.document}, whole=True)
+    rejects(LOOP, {**document, "errors": errors}, "^errors: not with a periodic rule, .* or with noise")
 
 
 # The scenario.
@@ -241,10 +245,8 @@ def test_noise_is_refused_if_the_start_is_known() -> None:
 
 def test_forms_that_do_not_change_between_tests_need_no_silent_edges() -> None:
     """With a deadline and an assumed error they have one node: a silent test leaves V as it is."""
-    loop = noisy(double_integrator(floor=0.03))
-    loop = loop._replace(rule=loop.rule._replace(always=True))
-    errors = Errors(arb(1), arb(1), Chain(arb(2), arb(2)))
-    model = Model(loop, number(0.3), number(0.8), errors)
+    loop = with_rule(double_integrator(floor=0.03), always=True)
+    model = Model(loop, number(0.3), number(0.8), Errors(arb(1), arb(1)))
     assert len(model.locations[0].nodes) == 1
     names = {item.name for item in model.inequalities("x", starts=True)}
     assert names

@@ -111,8 +111,9 @@ def test_a_dwell_time_has_no_test_that_counts() -> None:
 
 def test_too_many_places_are_rejected() -> None:
     loop = dynamic()._replace(times=Times(T, T, fmpq(1, 5), fmpq(0), fmpq(0)))
+    of_nothing = {"output": "x", "decay": 1.0, "matrices": {}, "numbers": {}}
     with pytest.raises(RejectedError, match="ways in which updates"):
-        prove_statement(loop, {"rate": 0.0, "later": 8, "bounds": [{"output": "x", "decay": 1.0}]})
+        prove_statement(loop, {"rate": 0.0, "later": 8, "bounds": [of_nothing]})
 
 
 def test_each_way_to_the_next_memory_has_an_edge() -> None:
@@ -182,11 +183,11 @@ CHANGES: dict[str, Callable[[Loop], Loop]] = {
 
 
 REASONS = {
-    "one loss more": "flow/1 lost|edge/1 lost, dwells, lost, 2 lost",
+    "one loss more": "motion/1 lost|edge/1 lost, dwells, lost, 2 lost",
     "larger start": "start$",
-    "another plant": "flow/0 lost/",
-    "a disturbance": "flow/0 lost/",
-    "tests twice as far apart": "flow/0 lost/|edge/0 lost, silent",
+    "another plant": "motion/0 lost/",
+    "a disturbance": "motion/0 lost/",
+    "tests twice as far apart": "motion/0 lost/|edge/0 lost, silent",
 }
 
 
@@ -199,22 +200,22 @@ def arb_column(n: int) -> Any:
 def test_a_witness_proves_nothing_about_another_loop(name: str, change: str) -> None:
     loop, witness = base(name)
     other = CHANGES[change](loop)
-    with pytest.raises(RejectedError, match=f"^(x|e_c): ({REASONS[change]})"):
+    with pytest.raises(RejectedError, match=f"at ({REASONS[change]})"):
         prove_statement(other, completed(other, witness.document, whole=True))
 
 
 def test_a_longer_dwell_time_and_another_memory_are_rejected() -> None:
     loop, witness = base("dwell")
     longer = loop._replace(times=loop.times._replace(dwell=8 * T))
-    with pytest.raises(RejectedError, match=r"^e_c: flow/0 lost, dwells/"):
+    with pytest.raises(RejectedError, match="controller's model: not proven at motion/0 lost, dwells/"):
         prove_statement(longer, completed(longer, witness.document, whole=True))
     loop, witness = base("dynamic")
     memory = loop.rule.memory
     assert memory is not None
     for other, reason in (
-        (memory._replace(gain=memory.gain * 2), r"^x: edge/0 lost, silent"),
-        (memory._replace(start=arb(9)), r"^x: start$"),
-        (memory._replace(decay=arb(0)), r"^x: edge/0 lost, silent"),
+        (memory._replace(gain=memory.gain * 2), r"at edge/0 lost, silent"),
+        (memory._replace(start=arb(9)), r"at start$"),
+        (memory._replace(decay=arb(0)), r"at edge/0 lost, silent"),
     ):
         changed = loop._replace(rule=loop.rule._replace(memory=other))
         with pytest.raises(RejectedError, match=reason):
@@ -229,7 +230,7 @@ def test_a_negative_coefficient_of_the_memory_is_rejected() -> None:
     for name in numbers:
         if name.startswith("eta/"):
             numbers[name] = -abs(numbers[name])
-    with pytest.raises(RejectedError, match=r"^x: edge/0 lost, silent"):
+    with pytest.raises(RejectedError, match="edge/0 lost, silent, 0 lost/1 0: a multiplier below 0"):
         prove_statement(loop, document)
 
 
@@ -245,7 +246,7 @@ def test_a_witness_counts_as_many_tests_as_it_has_forms_for() -> None:
     loop, witness = base("held")
     counted: Any = witness.document["counted"]
     for other in (0, counted // 2, counted + 1, 10**6, -1):
-        with pytest.raises(RejectedError, match=r"missing|counted"):
+        with pytest.raises(RejectedError, match=r"not proven at edge/|unknown matrix|^counted"):
             prove_statement(loop, {**witness.document, "counted": other})
     with pytest.raises(RejectedError, match="counted"):
         prove_statement(double_integrator(SCHEDULE), {"rate": 0.0, "counted": 4, "bounds": []})
@@ -255,7 +256,7 @@ def test_the_drift_bounds_no_error_during_a_dwell_time() -> None:
     loop, witness = base("dwell")
     document: Any = copy.deepcopy(witness.document)
     document["bounds"][0]["output"] = "drift"
-    with pytest.raises(RejectedError, match=r"^drift: output/0 lost/"):
+    with pytest.raises(RejectedError, match="mismatch of the sensor's model: not proven at output/0 lost/"):
         prove_statement(loop, document)
     with pytest.raises(RejectedError, match="errors"):
         prove_statement(loop, {**witness.document, "errors": {"decaying": 1.0, "constant": 1.0}})
