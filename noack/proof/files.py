@@ -41,6 +41,7 @@ def proof_files(loop: Loop, statement: Mapping[str, object], naming: Naming) -> 
         NoDocumentError: it has no bounds by quadratic forms, or no document describes the loop.
     """
     document = document_of(loop, statement, naming)
+    document.require_counted()
     proof = write_proof(document, _bounds(statement), apart_of(loop, statement))
     return ProofFiles(document.table, as_text(document.table), as_text(proof), document.output_names)
 

@@ -154,7 +154,6 @@ class LoopDocument:
         self.edge_names = self._edge_names()
         edges = [self._edge(edge, name) for edge, name in self.edges]
         self.dead_edges = [*self._dead_edges()]
-        self._require_counted()
         self.output_names = self._output_names([*dict.fromkeys(outputs)])
         self.outputs = [self._output(name) for name in self.output_names]
         self.table: Table = {
@@ -488,8 +487,12 @@ class LoopDocument:
                 "event": True,
             }
 
-    def _require_counted(self) -> None:
-        """Require that the document has all events that the times of tests allow, or excludes them."""
+    def require_counted(self) -> None:
+        """Require that the document has all events that the times of tests allow, or excludes them.
+
+        Raises:
+            NoDocumentError: it has not, so a proof would not be about the loop.
+        """
         times, dead = self.loop.times, {str(edge["from"]) for edge in self.dead_edges}
         counts = {
             "0 later": (self._assumed.later, times.delay),
