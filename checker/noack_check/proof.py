@@ -81,6 +81,10 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     """
     if fault := loop.fault():
         raise RejectedError(f"loop: {fault}")
+    try:
+        loop.weight.inv()
+    except ZeroDivisionError:
+        raise RejectedError("weight: not proven to have an inverse") from None
     if not rate >= 0 or not (loop.rule.level == 0 or rate <= loop.rule.rate):
         raise RejectedError("rate: not between 0 and that of the threshold")
     later, at_start = (read_count(document, key, MOST_LATER) for key in ("later", "later_at_start"))
