@@ -5,18 +5,22 @@ threshold. With a held input Ww does not move, and an event adds We. The numbers
 point, with some room; the kernel verifies them.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from flint import arb, arb_mat
 
 from noack.proof.event_times import Levels
-from noack.proof.loop_document import BOUND_OF_E, BOUND_OF_W, DRIFT, LoopDocument, Table
+from noack.proof.loop_document import BOUND_OF_E, BOUND_OF_W, DRIFT, ERROR, LoopDocument, Table
 from noack.proof.numbers import Fractions, as_written, quotient, written
 from noack.proof.quiet_start import NAME as QUIET
+from noack.proof.quiet_start import QuietStart
 from noack_check.balls import number
+from noack_check.model import thresholds
 from noack_check.norms import growth
 from noack_check.proof import weighted
 
@@ -33,20 +37,23 @@ Squares = tuple[float, float]
 
 
 class ErrorRows:
-    """Bounds of We, and of Ww if the input is held.
+    """Bounds of We, and of Ww if the input is held and forms need it.
 
     Args:
         document: the loop document.
         drift: the proven bound of the mismatch.
-        lemmas: of the proof.
+        quiet: the lemma that no event comes before the first input; None: an input acts at once.
     """
 
-    def __init__(self, document: LoopDocument, drift: Levels, lemmas: list[Table]) -> None:
-        self._document, self._drift = document, drift
+    def __init__(self, document: LoopDocument, drift: Levels, quiet: QuietStart | None) -> None:
+        self._document, self._drift, self._quiet = document, drift, quiet
         self._loop, errors = document.loop, document.model.errors
-        assert errors is not None
-        self._most: Squares = float(errors.decaying) ** 2, float(errors.constant) ** 2
-        self._quiet = next((lemma for lemma in lemmas if lemma["name"] == QUIET), None)
+        self._most: Squares = (math.inf, math.inf)
+        if errors is not None:
+            self._most = float(errors.decaying) ** 2, float(errors.constant) ** 2
+        self._needs_w = errors is not None and self._loop.holds
+        level, floor = (float(size) for size in thresholds(self._loop, document.rate))
+        self._threshold: Squares = level**2 * _ROOM, floor**2 * _ROOM
         self._places = [
             place for place in document.table["locations"] if not place["name"].startswith("start")
         ]
@@ -56,16 +63,24 @@ class ErrorRows:
 
     def entries(self) -> Iterator[Table]:
         """Yield the entries of the proof; none if the errors grow beyond what is assumed."""
-        if (of_e := self._of_e()) is not None:
+        if (of_e := self._of_e) is not None:
             if of_e["in"]:
                 yield of_e
-            if self._loop.holds:
+            if self._needs_w:
                 yield self._of_w()
+
+    @property
+    def are_throughout(self) -> bool:
+        """Whether We has a bound at all times, before the first input, too."""
+        starts = [p for p in self._document.table["locations"] if p["name"].startswith("start")]
+        is_quiet = self._quiet is not None and self._quiet.is_throughout and self._quiet.share > 0
+        return self._of_e is not None and (is_quiet or not starts)
 
     # The sensor's error.
 
+    @cached_property
     def _of_e(self) -> Table | None:
-        """Return the bound of We."""
+        """The bound of We; None: it would exceed what is assumed."""
         names = [place["name"] for place in self._places if place["name"] not in self._is_silent]
         enter: dict[str, Squares] = dict.fromkeys(names, (0.0, 0.0))
         within = {name: self._grown(name, squares) for name, squares in enter.items()}
@@ -88,7 +103,7 @@ class ErrorRows:
             "multipliers": {
                 f"edge/{edge['name']}": table
                 for edge in self._edges
-                if edge["to"] in enter and (table := self._reason(edge, enter[edge["to"]]))
+                if edge["to"] in enter and (table := self._reason(edge))
             },
         }
 
@@ -102,59 +117,92 @@ class ErrorRows:
         if edge.get("event"):
             return None
         if edge["from"].startswith("start") or self._has_silent(edge):
-            level, floor = float(self._document.model.level), float(self._document.model.floor)
-            return level**2 * _ROOM, floor**2 * _ROOM
+            return self._threshold
         squares = within[edge["from"]][0]
         return squares[0] * _ROOM, squares[1] * _ROOM
 
-    def _reason(self, edge: Table, enter: Squares) -> Table | None:
+    def _reason(self, edge: Table) -> Table | None:
         """Return the multipliers that prove the bound after an edge."""
         if edge.get("event"):
             return None
         if edge["from"].startswith("start"):
-            return self._after_start(enter)
+            return self._after_start()
         return {"facts": {"silent" if self._has_silent(edge) else BOUND_OF_E: 1}}
 
     def _has_silent(self, edge: Table) -> bool:
         """Return whether We is at most the threshold before an edge, since the trigger was silent."""
         return "silent" in edge["facts"] or edge["from"] in self._is_silent
 
-    def _after_start(self, enter: Squares) -> Table | None:
+    def _after_start(self) -> Table | None:
         """Return the multiplier of the lemma that no event comes before the first input.
 
         It says that We is below the threshold: P + Σ m q ⪰ 0 with the facts q of an event.
         """
-        if self._quiet is None:
+        if self._quiet is None or not self._quiet.share > 0:
             return None
-        numbers = [
-            sum(float(Fraction(str(value))) for value in table["facts"].values())
-            for name, table in self._quiet["multipliers"].items()
-            if name.startswith("edge/") and "above" in table
-        ]
-        return {"form": {"name": QUIET, "times": 1 / max(numbers)}} if min(numbers) > 0 else None
+        return {"form": {"name": QUIET, "times": 1 / self._quiet.share}}
 
     def _grown(self, place: str, enter: Squares) -> tuple[Squares, float | None]:
         """Return the squares of a bound of We in a location, and the split that gives them."""
         (location,) = (each for each in self._places if each["name"] == place)
         largest, total = self._growth(float(Fraction(str(location["clock"]))))
         if not any(enter):
-            return tuple((total * size * _ROOM) ** 2 * _ROOM for size in self._drift), None  # type: ignore[return-value]
-        best = None
-        for split in map(float, _SPLITS):
-            squares = tuple(
-                ((1 + 1 / split) * (total * size) ** 2 + (1 + split) * largest**2 * first) * _ROOM**2
-                for size, first in zip(self._drift, enter, strict=True)
-            )
-            shares = [most / limit for most, limit in self._pairs(squares)]  # type: ignore[arg-type]
-            if best is None or max(shares) < best[0]:
-                best = max(shares), squares, split
-        assert best is not None
-        return best[1], best[2]  # type: ignore[return-value]
+            return self._grown_by(0.0, total, enter), None
+        found = {s: self._grown_by(largest, total, enter, float(s)) for s in _SPLITS}
+        split = min(found, key=lambda s: self._size(found[s]))
+        return found[split], float(split)
+
+    def _grown_by(self, largest: float, total: float, enter: Squares, split: float = math.inf) -> Squares:
+        """Return (1 + s) g² N² + (1 + 1/s) I² D² in both units; an infinite s is for N = 0."""
+        grown = []
+        for size, first in zip(self._drift, enter, strict=True):
+            pushed = (1 + 1 / split) * (total * size) ** 2
+            grown.append((pushed + ((1 + split) * largest**2 * first if first else 0.0)) * _ROOM**2)
+        return grown[0], grown[1]
+
+    def _size(self, squares: Squares) -> float:
+        """Return what a split makes small: the largest share of what is assumed, or of the thresholds."""
+        pairs = self._pairs(squares)
+        if math.isinf(self._most[0]):
+            pairs = [(most, least or 1.0) for (most, _), least in zip(pairs, self._threshold, strict=False)]
+            return sum(most / least for most, least in pairs)
+        return max(most / limit for most, limit in pairs)
 
     def _growth(self, within_s: float) -> tuple[float, float]:
         G: arb_mat = weighted(self._loop, arb(self._document.rate))
         largest, total = (float(each.abs_upper()) for each in growth(G, number(within_s)))
         return largest * _ROOM, total * _ROOM
+
+    def bound(self) -> Table:
+        """Return the proof's entry of the bound of We, which follows from its bounds in all locations.
+
+        Before the first input the lemma bounds it by the threshold.
+        """
+        levels, multipliers, of_e = self._threshold, dict[str, Table](), self._of_e
+        assert of_e is not None
+        for place in self._places:
+            name, fact = place["name"], "silent" if place["name"] in self._is_silent else BOUND_OF_E
+            if fact == BOUND_OF_E:
+                decaying, constant = of_e["in"][name]["within"]
+                levels = _largest(levels, (decaying, constant))
+            multipliers[f"output/{name}/0"] = {"facts": {fact: 1}}
+        forms: dict[str, Table] = {place["name"]: {"nodes": [0], "terms": [[]]} for place in self._places}
+        if self._quiet is not None:
+            (start,) = (name for name in self._quiet.lemma["forms"] if name.startswith("start"))
+            nodes = self._quiet.lemma["forms"][start]["nodes"]
+            forms[start] = {"nodes": nodes, "terms": [[] for _ in nodes]}
+            used = {"forms": {QUIET: 1 / self._quiet.share}}
+            multipliers |= {f"output/{start}/piece {piece}": used for piece in range(len(nodes) - 1)}
+        units = [self._document.has(unit) for unit in ("f1", "f2")]
+        return {
+            "output": self._document.output_names[ERROR],
+            "from": "start",
+            "decay": 0,
+            "levels": [level * _ROOM if is_unit else 0 for level, is_unit in zip(levels, units, strict=True)],
+            "matrices": {},
+            "forms": forms,
+            "multipliers": multipliers,
+        }
 
     # What the acting input lacks.
 

@@ -10,11 +10,12 @@ from flint import arb
 
 from noack.proof.error_rows import ErrorRows
 from noack.proof.event_times import EventTimes, levels_of
-from noack.proof.loop_document import DRIFT, ETA, LoopDocument, Table
+from noack.proof.loop_document import DRIFT, ERROR, ETA, LoopDocument, Table
 from noack.proof.numbers import as_written, quotient, simplest
 from noack.proof.quiet_start import write_quiet_start
 from noack_check.balls import is_zero
 from noack_check.model import Edge, Signal
+from noack_check.proof import compares_error
 
 FORMAT = "noack-forms 1"
 
@@ -185,17 +186,23 @@ def write_proof(document: LoopDocument, bounds: Sequence[Mapping[str, Any]], apa
 
     ``apart_s``: the time that two events are at least apart, as the search has found it; 0: none.
     """
-    digest = hashlib.sha256(as_text(document.table).encode()).hexdigest()
     found = [write_bound(document, bound) for bound in bounds]
-    proof: Table = {"format": FORMAT, "document": digest, "bounds": found}
+    proof: Table = {"format": FORMAT, "document": "", "bounds": found}
     at_start = [edge for edge in document.dead_edges if edge["from"].startswith("start")]
-    if lemmas := [lemma for edge in at_start if (lemma := write_quiet_start(document, edge)) is not None]:
-        proof["lemmas"] = lemmas
+    quiet = next(filter(None, (write_quiet_start(document, edge) for edge in at_start)), None)
+    if quiet is not None:
+        proof["lemmas"] = [quiet.lemma]
     levels = levels_of(bounds)
-    if document.model.errors is not None and DRIFT in levels:
-        proof["rows"] = [*ErrorRows(document, levels[DRIFT], lemmas).entries()]
+    if DRIFT in levels and compares_error(document.loop) and not document.model.sources:
+        rows = ErrorRows(document, levels[DRIFT], quiet)
+        if document.model.errors is not None or rows.are_throughout:
+            proof["rows"] = [*rows.entries()]
+        if rows.are_throughout:
+            document.add_output(ERROR)
+            found.append(rows.bound())
     if times := [*EventTimes(document, levels).entries(apart_s)]:
         proof["times"] = times
+    proof["document"] = hashlib.sha256(as_text(document.table).encode()).hexdigest()
     return proof
 
 

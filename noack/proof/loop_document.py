@@ -57,6 +57,7 @@ ETA, NEXT_ETA = "√η", "next √η"
 """The coordinate of a rule's dynamic variable η, and its value after a test."""
 BOUND_OF_E, BOUND_OF_W = "bound of e", "bound of w"
 """What a proof has as bounds of rows."""
+ERROR = "e_s"
 DRIFT = "drift"
 """The output W(ẋ − Hx), as the search calls it."""
 
@@ -597,6 +598,11 @@ class LoopDocument:
             if where:
                 found[reading] = [{"rows": self.columns(rows), "in": where}]
         return found
+
+    def add_output(self, name: str) -> None:
+        """Add an output, as the search calls it, to the document."""
+        self.output_names[name] = _untaken(self.naming.output(name), self.output_names.values())
+        self.outputs.append(self._output(name))
 
     def _limits(self) -> Iterator[Table]:
         """Yield the limits of a region; each is one of an output that is bounded."""

@@ -6,7 +6,7 @@ between some times θ, is at most 0 there, and above 0 where an event is possibl
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
@@ -25,22 +25,34 @@ _SMALL = 1e-3
 """A coordinate counts as at least this share of the largest one."""
 
 
-def write_quiet_start(document: LoopDocument, edge: Table) -> Table | None:
+class QuietStart(NamedTuple):
+    """The lemma that no event comes before the first input."""
+
+    lemma: Table
+    """The proof's entry."""
+    is_throughout: bool
+    """An event is excluded at all times before the first input, not only at those of tests."""
+    share: float
+    """The sum of the multipliers of an event's facts: |We|² is at most the threshold's, plus V over this."""
+
+
+def write_quiet_start(document: LoopDocument, edge: Table) -> QuietStart | None:
     """Return the lemma that an event before the first input is never taken; None: the solver finds none.
 
     Args:
         document: the loop document.
         edge: the event, which leads nowhere.
     """
-    for pieces in _PIECES:
-        problem = _QuietStart(document, edge, pieces)
-        if (answer := problem.solve()) is not None:
-            return problem.lemma(answer)
+    for throughout in (True, False):
+        for pieces in _PIECES:
+            problem = _Problem(document, edge, pieces, is_throughout=throughout)
+            if (answer := problem.solve()) is not None:
+                return QuietStart(problem.lemma(answer), throughout, problem.share(answer))
     return None
 
 
-class _QuietStart:
-    def __init__(self, document: LoopDocument, edge: Table, pieces: int) -> None:
+class _Problem:
+    def __init__(self, document: LoopDocument, edge: Table, pieces: int, *, is_throughout: bool) -> None:
         self._document, self._edge, table = document, edge, document.table
         names = [entry["name"] for entry in table["coordinates"]]
         self._index = {name: index for index, name in enumerate(names)}
@@ -55,6 +67,7 @@ class _QuietStart:
             if (k == pieces or self._nodes[k + 1] > first) and (k == 0 or self._nodes[k - 1] < last)
         ]
         """Nodes that cover the times at which an event is possible."""
+        self._excluded = range(pieces + 1) if is_throughout else self._at_edge
         units = [unit for unit in ("f1", "f2") if unit in self._index]
         self._units = units
         self._inside = sorted(self._index[name] for name in [*self._place["coordinates"], *units])
@@ -136,11 +149,10 @@ class _QuietStart:
             name: max(float(np.abs(self._scaled(Q, kept, scales)).max()), 1e-300)
             for name, Q in self._facts.items()
         }
-        for node in self._at_edge:
-            scalars = tuple(
-                (f"event {node}/{name}", self._scaled(Q, kept, scales) / sizes[name])
-                for name, Q in self._facts.items()
-            )
+        scalars = tuple(
+            (f"event {name}", self._scaled(Q, kept, scales) / sizes[name]) for name, Q in self._facts.items()
+        )
+        for node in self._excluded:
             parts = ((f"P{node}", z / 2, z),)
             yield MatrixInequality(parts, (*scalars, ("above", -units)), np.zeros((len(kept), len(kept))))
 
@@ -148,6 +160,14 @@ class _QuietStart:
         return Q[np.ix_(kept, kept)] * np.outer(scales, scales)
 
     # The lemma.
+
+    def share(self, answer: SolverAnswer) -> float:
+        """Return the sum of the multipliers of an event's facts."""
+        return sum(value for fact, value in self._of_event(answer).items() if not fact.startswith("noise "))
+
+    def _of_event(self, answer: SolverAnswer) -> dict[str, float]:
+        numbers = {fact: max(answer.numbers.get(f"event {fact}", 0.0), 0.0) for fact in self._facts}
+        return {fact: number / self._size_of(fact) for fact, number in numbers.items()}
 
     def lemma(self, answer: SolverAnswer) -> Table:
         """Return the proof's entry."""
@@ -182,10 +202,7 @@ class _QuietStart:
             if signals:
                 yield f"motion/{name}/{node}", {"unknown": signals}
         for node in self._at_edge:
-            facts = {
-                fact: max(numbers.get(f"event {node}/{fact}", 0.0), 0.0) / self._size_of(fact)
-                for fact in self._facts
-            }
+            facts = self._of_event(answer)
             above = {
                 unit: numbers["above"] / 2 / self._scales[self._index[unit]] ** 2 for unit in self._units
             }

@@ -34,7 +34,7 @@ def is_quiet(loop: Loop, rate: arb | None = None) -> bool:
         "forms": {place: {"nodes": [0], "terms": [[]]} for place in places},
         "multipliers": {},
     }  # fmt: skip
-    lemmas = [lemma for edge in document.dead_edges if (lemma := write_quiet_start(document, edge))]
+    lemmas = [found.lemma for edge in document.dead_edges if (found := write_quiet_start(document, edge))]
     proof = {"format": FORMAT, "lemmas": lemmas, "bounds": [bound]}
     try:
         prove(as_text(document.table | {"outputs": [output]}), as_text(proof))

@@ -11,7 +11,7 @@ from cosim.analysis.witnesses import find_witnesses
 from cosim.shipped_files import shipped_names
 from noack.core.errors import ExitStatus
 from noack.scenario.resolution import ResolvedRun
-from noack_check.__main__ import main
+from noack_verify.__main__ import main
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import shipped
 

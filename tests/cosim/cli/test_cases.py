@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from noack_check.__main__ import main as check
+from noack_verify.__main__ import main as check
 from tests.helpers.command_line import invoke
 
 CASES = Path(__file__).parents[2] / "cases"
