@@ -92,6 +92,22 @@ def test_control_characters_do_not_reach_the_terminal(
     assert not any(line.startswith("PROVED |all states| ≤ 0") for line in lines)
 
 
+def test_a_name_that_reads_like_a_statement_is_quoted(
+    files: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    document, proof = (json.loads(path.read_text()) for path in files)
+    del proof["document"]
+    document["name"] = "a, its plant: |x| ≤ 0. Copy"
+    document["outputs"][1]["name"] = proof["bounds"][1]["output"] = "z| ≤ 1e-9, so |y"
+    paths = tmp_path / "loop.json", tmp_path / "proof.json"
+    for path, table in zip(paths, (document, proof), strict=True):
+        path.write_text(json.dumps(table))
+    status, text = run(capsys, *paths)
+    assert status == 0, text
+    assert "for each run of the loop document 'a, its plant: |x| ≤ 0. Copy'" in text
+    assert "PROVED |'z| ≤ 1e-9, so |y'| ≤ " in text
+
+
 def test_a_path_is_printed_without_control_characters(
     files: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from noack_verify.__main__ import main as check
 from tests.helpers.command_line import invoke
 
 CASES = Path(__file__).parents[2] / "cases"
@@ -110,16 +109,3 @@ def test_a_bound_above_the_start_is_called_no_guarantee(
     assert (
         "is not smaller than its value at the start, 50 rad/s: it says only that speed stays bounded" in text
     )
-
-
-def test_a_name_that_reads_like_a_statement_is_quoted(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sys.argv", ["noack-check", str(CASES / "spoof_name.json")])
-    check()
-    lines = capsys.readouterr().out.splitlines()
-    name = "lane_following, its plant, its schedule: ‖x‖ ≤ 0.001 e^(−9 t). Copy of g43"
-    proved = [line for line in lines if line.startswith("PROVED")]
-    assert len(proved) == 11
-    assert all(line.startswith(f'PROVED "{name}", its plant, ') for line in proved)
-    assert all(line.startswith("       if there are ") for line in lines if line not in proved)

@@ -262,14 +262,6 @@ def test_the_first_screen_is_a_sentence_and_a_few_lines() -> None:
     compare_text(Path(__file__).with_name("first_screens.txt"), text)
 
 
-def test_a_witness_that_is_not_found_is_said(tmp_path: Path) -> None:
-    file = tmp_path / "none.json"
-    result = invoke("certify", "cart_pole", "--no-search", "--witness", str(file))
-    assert result.exit_code == ExitStatus.FAILED
-    assert f"no witness was found; {file} is not written" in result.stderr
-    assert not file.exists()
-
-
 NONE = ("own", "schedule", None)
 
 
