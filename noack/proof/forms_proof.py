@@ -195,9 +195,10 @@ def write_proof(document: LoopDocument, bounds: Sequence[Mapping[str, Any]], apa
     levels = levels_of(bounds)
     if DRIFT in levels and compares_error(document.loop) and not document.model.sources:
         rows = ErrorRows(document, levels[DRIFT], quiet)
-        if document.model.errors is not None or rows.are_throughout:
+        has_bound = rows.are_throughout and ERROR not in document.output_names
+        if document.model.errors is not None or has_bound:
             proof["rows"] = [*rows.entries()]
-        if rows.are_throughout:
+        if has_bound:
             document.add_output(ERROR)
             found.append(rows.bound())
     if times := [*EventTimes(document, levels).entries(apart_s)]:

@@ -45,13 +45,13 @@ def write_quiet_start(document: LoopDocument, edge: Table) -> QuietStart | None:
     """
     for throughout in (True, False):
         for pieces in _PIECES:
-            problem = _Problem(document, edge, pieces, is_throughout=throughout)
+            problem = _StartProblem(document, edge, pieces, is_throughout=throughout)
             if (answer := problem.solve()) is not None:
                 return QuietStart(problem.lemma(answer), throughout, problem.share(answer))
     return None
 
 
-class _Problem:
+class _StartProblem:
     def __init__(self, document: LoopDocument, edge: Table, pieces: int, *, is_throughout: bool) -> None:
         self._document, self._edge, table = document, edge, document.table
         names = [entry["name"] for entry in table["coordinates"]]

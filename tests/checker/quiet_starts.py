@@ -24,6 +24,7 @@ def is_quiet(loop: Loop, rate: arb | None = None) -> bool:
     assumed = Assumptions(None, MOST_LATER, 0, noise=noise_of(loop, rate))
     try:
         document = LoopDocument(loop, rate, assumed, (), Naming("a loop"))
+        document.require_counted()
     except NoDocumentError:
         return False
     places, unit = [place.name for place in document.model.locations], "f2" if document.has("f2") else "f1"

@@ -260,7 +260,8 @@ def test_an_update_is_on_its_way_until_an_input_from_it_acts() -> None:
 def is_described(loop: Loop, later: int, at_start: int) -> bool:
     """Return whether a document with some events while an update is on its way has all that tests allow."""
     try:
-        LoopDocument(loop, loop.rule.rate, Assumptions(None, later, at_start), (), Naming("a loop"))
+        assumed = Assumptions(None, later, at_start)
+        LoopDocument(loop, loop.rule.rate, assumed, (), Naming("a loop")).require_counted()
     except NoDocumentError:
         return False
     return True

@@ -65,7 +65,9 @@ def test_the_kernel_proves_what_the_checker_proves(name: str) -> None:
     document, proof = files_of(stored)
     statements = prove(as_text(document), as_text(proof)).bounds
     entries = stored.document["bounds"]
-    assert len(statements) == len(entries)
+    further = statements[len(entries) :]
+    assert {statement.output for statement in further} <= {"error of the sensor's model"}
+    statements = statements[: len(entries)]
     for statement, entry in zip(statements, entries, strict=True):
         levels = [entry["numbers"].get(f"level {k}", 0.0) for k in (1, 2)]
         assert [float(arb(level).mid()) for level in statement.levels] == pytest.approx(levels, rel=1e-15)

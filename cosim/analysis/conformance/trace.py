@@ -1,7 +1,7 @@
 """What a recorded loop did, in the words of its loop document: where it was, which edges it took, and z.
 
 A location changes only at some steps: at events, when an update begins to act, and at the silent tests that a
-document counts. :class:`_Walk` follows these; what each step needs is computed for all steps at once.
+document counts. :class:`_RecordWalk` follows these; what each step needs is computed for all steps at once.
 """
 
 from collections.abc import Iterator, Mapping
@@ -239,7 +239,7 @@ class _Tracer:
 
     def trace(self, most_items: int) -> Trace:
         """Return the path and its states."""
-        walk = _Walk(self._document, self._acts, self._order, self._is_event, self._is_test)
+        walk = _RecordWalk(self._document, self._acts, self._order, self._is_event, self._is_test)
         changes = [*walk.changes()]
         last_step = len(self._t_ns) - 1 if walk.missing is None else changes[-1].key // _STAGES
         keys = self._keys(changes, walk.is_shown, last_step)
@@ -381,7 +381,7 @@ class _Tracer:
         z[np.ix_(at, np.array(document.noise))] = _within(document.noise_columns, noise, limits)
 
 
-class _Walk:
+class _RecordWalk:
     """The changes of location of a run, in order.
 
     Args:
