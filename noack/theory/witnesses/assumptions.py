@@ -82,6 +82,7 @@ def starts_quietly(loop: Loop, rate: float) -> bool:
     none = Assumptions(None, 0, 0, noise=noise_of(loop, number(rate)))
     try:
         document = LoopDocument(loop, number(rate), none, (), Naming("loop"))
+        document.require_counted()
     except NoDocumentError:
         return False
     edges = [edge for edge in document.dead_edges if edge["from"].startswith("start")]
