@@ -28,7 +28,7 @@ def witness() -> Proved:
 def test_bounds_are_near_what_is_simulated(witness: Proved) -> None:
     sizes = bounds_of(witness.proof)
     assert 1.0 <= sizes["x"] < 1.5  # it begins at 1
-    assert 0.05 <= sizes["e_s"] < 0.062  # the threshold is 0.05
+    assert 0.05 <= sizes["e_s"] < 0.06  # the threshold is 0.05
     assert sizes["e_s"] < sizes["e_c"] < 0.4
     assert witness.proof.inter_event is not None
     assert 0.02 <= float(witness.proof.inter_event) < 0.2
@@ -37,7 +37,7 @@ def test_bounds_are_near_what_is_simulated(witness: Proved) -> None:
 @pytest.mark.parametrize(("name", "floor"), [("ideal", 0.0), ("ideal_floor", 0.01)])
 def test_ideal_conditions_give_smaller_bounds(witness: Proved, name: str, floor: float) -> None:
     ideal = bounds_of(proved(name).proof)
-    assert ideal["e_s"] <= 1.002 * math.hypot(0.05, floor)  # of the threshold
+    assert ideal["e_s"] <= math.hypot(0.05, floor) * (1 + 1e-6)
     assert ideal["x"] < bounds_of(witness.proof)["x"] + floor
 
 
