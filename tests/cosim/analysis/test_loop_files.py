@@ -105,10 +105,6 @@ def test_the_document_in_words_has_all_that_is_in_the_file(files: tuple[Path, Pa
     ("words", "line"),
     [
         (("certify", "unstable_pendulum", "--document", "a.json"), "noack-check needs both files"),
-        (
-            ("check", "tabuada_dynamic", "--document"),
-            "there is no loop document: a rule with a dynamic variable",
-        ),
         (("check", "lane_acknowledged", "--document"), "there is no proof: "),
     ],
 )
