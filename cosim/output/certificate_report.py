@@ -142,7 +142,8 @@ def _first_sentence(results: Certificates) -> Sentence:
         return Sentence(text=text, role=SentenceRole.VERDICT, tone=tone, is_prose=True)
     why = results.answer.text.removeprefix("no certificate").lstrip(": ")
     if _is_stable(results):
-        text = f"stable if nothing is late{although_lost(results.scenario)} (proved); no bound: {why}"
+        late = "" if results.stability is None else _lateness(results.stability.late)
+        text = f"stable {late}{although_lost(results.scenario)} (proved); no bound: {why}"
         return Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.DOUBTFUL, is_prose=True)
     text = f"no guarantee{f': {why}' if why else ''}"
     return Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.DOUBTFUL, is_prose=True)
@@ -237,7 +238,14 @@ def _stability_in_words(results: Certificates) -> Iterator[str]:
         f"destabilises the loop: {growth}",
         "undecided": f"Not decided whether the loop is stable for {patterns}: {growth} under the worst one",
     }[stability.verdict]
-    yield f"{text}. This is without lateness; noack margin finds the limits."
+    yield f"{text}. This is {_lateness(stability.late)}; noack margin finds the limits."
+
+
+def _lateness(steps: int) -> str:
+    """Return how late inputs may act for what is proven of the growth."""
+    if not steps:
+        return "if nothing is late"
+    return f"if inputs act at most {steps} step{'s' * (steps > 1)} of the plant late"
 
 
 def _title(results: Certificates) -> str:

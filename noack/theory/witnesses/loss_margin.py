@@ -53,6 +53,8 @@ class Stability(NamedTuple):
     """The time from each update of the pattern to the next one."""
     entries: Mapping[str, Entry] = MappingProxyType({})
     """The entries of a proof of both bounds, "most" and "least"; none for the older verifier."""
+    late: int = 0
+    """Inputs may act so many steps of the plant late."""
 
     @property
     def verdict(self) -> str:
@@ -261,6 +263,7 @@ class LossMargin:
             tuple(delivered for _, delivered, _ in outcomes),
             tuple(self.seconds(units * self._unit) for _, _, units in outcomes),
             {key: entry for key, entry in (("most", found.most), ("least", found.least)) if entry},
+            self.late,
         )
 
     def _from_first(self, outcomes: Sequence[tuple[int, bool, int]]) -> list[tuple[int, bool, int]]:
