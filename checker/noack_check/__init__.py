@@ -1,6 +1,6 @@
-"""Verifies the witnesses of noack's bounds; imports nothing of noack.
+"""From a resolved scenario to the loop, for those who write documents and search for proofs; not trusted.
 
-Read in this order: :mod:`.loop` (what a statement depends on), :mod:`.model` (the loop as a hybrid
-system, and the inequalities that prove a bound, with the argument), :mod:`.proof` (what follows for the
-errors and the times between events), :mod:`.norms` and :mod:`.balls` (the arithmetic).
+Read in this order: :mod:`.loop` (what a statement depends on), :mod:`.model` (the loop as a hybrid system, and the
+inequalities that a search solves), :mod:`.proof` (what a search states and assumes), :mod:`.norms` and
+:mod:`.balls` (the arithmetic).
 """

@@ -2,7 +2,7 @@
 
 from flint import arb, arb_mat
 
-from noack_check.balls import frobenius, identity, is_positive, square, transpose, upto
+from noack_check.balls import identity, is_positive, square, upto
 
 _CELLS = 64
 _MOST_CELLS = 20_000
@@ -29,37 +29,6 @@ def growth(G: arb_mat, until: arb) -> tuple[arb, arb]:
         largest, total = largest.max(norm), total + step * norm
         edge = edge * forward
     return arb(largest.abs_upper()), arb(total.abs_upper())
-
-
-def decays_below(G: arb_mat, bound: arb, tail: arb_mat) -> bool:
-    """Return whether ‖e^{Gτ}‖ ≤ ``bound`` is proven for all τ ≥ 0.
-
-    ``tail`` is a P ≻ 0 with GᵀP + PG ≺ 0, so ‖e^{Gs}‖ ≤ c, c² = λmax(P)/λmin(P), for all s: from the
-    time on at which c‖e^{Gτ}‖ ≤ ``bound``, nothing is left to show. Before it, on each cell of length s,
-    e^{G(τ+r)} lies within s²/8 · sup‖G² e^{G(τ+r)}‖ of its chord.
-    """
-    n = G.nrows()
-    if not (is_positive(tail) and is_positive(-1 * (transpose(G) * tail + tail * G))):
-        return False
-    try:
-        high, low = spectral_norm(tail), 1 / spectral_norm(tail.inv())
-    except ZeroDivisionError:
-        return False
-    constant = arb((high / low).sqrt().abs_upper())
-    edge, time, step = identity(n), arb(0), arb(1) / (4 * spectral_norm(G) + arb(2) ** -40)
-    for _ in range(_MOST_CELLS):
-        if constant * spectral_norm(edge) <= bound:
-            return True
-        step = arb(step.mid())
-        following = ((time + step) * G).exp()
-        curved = step**2 / 8 * frobenius(G * G * (upto(step) * G).exp() * edge)
-        if spectral_norm(edge).max(spectral_norm(following)) + curved <= bound:
-            edge, time, step = following, time + step, step * 13 / 10
-        else:
-            step = step / 2
-            if step < arb(2) ** -30:
-                return False
-    return False
 
 
 def lyapunov_function(F: arb_mat, Q: arb_mat) -> arb_mat | None:
