@@ -93,7 +93,8 @@ class ResetRows:
     def _verify_apart(self, apart: fmpq) -> None:
         """No event follows another one within ``apart`` once the loop is where the output has a bound.
 
-        Other edges leave Rz as it is there, and lead to nowhere else.
+        If the loop starts there, the start counts as an event. Other edges leave Rz as it is there, and lead to
+        nowhere else.
         """
         document, inside = self._document, {*self._output.locations}
         if any(edge.duration > 0 for edge in document.edges):
@@ -110,6 +111,8 @@ class ResetRows:
             if not edge.event and edge.source in inside and not self._is_kept(edge):
                 raise RejectedError(f"times: {edge.name} changes the rows, and is no event")
         self._require_reach(apart)
+        if document.start in inside:  # then the start counts as an event
+            self._verify_start()
         for edge in events:
             self._verify_reset(edge)
             self._verify_excluded(edge)
@@ -143,6 +146,15 @@ class ResetRows:
         source = self._document.locations[edge.source]
         M = of_units(self._document, self._after) - square(self.rows @ edge.jump)
         self._require(f"after/{edge.name}", M, facts_at(self._document, edge), source)
+
+    def _verify_start(self) -> None:
+        """N1² f1² + N2² f2² + Σ m q − |Rz(0)|² ⪰ 0: the same of the start."""
+        document, Z = self._document, self._document.start_columns
+        M = Z.T @ of_units(document, self._after) @ Z - square(self.rows @ Z)
+        M += of_facts(document, "start", self._numbers("start", {"facts"}), document.start_facts, Z)
+        self._count += 1
+        if not is_positive(M):
+            raise RejectedError("times: not proven at the start")
 
     def _verify_excluded(self, edge: Edge) -> None:
         """|Rz|² − E1² f1² − E2² f2² + Σ m q − ε f² ⪰ 0: the facts need a larger |Rz| than what is reached."""

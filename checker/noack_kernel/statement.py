@@ -116,7 +116,9 @@ class LeastTime:
     """Locations in which the loop may be at first, where nothing is proven."""
 
     def __str__(self) -> str:
-        after = f", once the loop has left {', '.join(map(repr, self.outside))}" if self.outside else ""
+        after = ", the start counted as one"
+        if self.outside:
+            after = f", once the loop has left {', '.join(map(repr, self.outside))}"
         return f"two events are at least {_rounded(self.apart, ROUND_FLOOR):g} s apart{after}"
 
 

@@ -76,22 +76,29 @@ class EventTimes:
         if (apart := self._least_apart(drift, apart_s)) is not None:
             within, found = apart
             events = [edge["name"] for edge in self._document.table["edges"] if self._is_counted(edge)]
-            yield {**self._entry(found, events, events), "apart": within}
+            entry = self._entry(found, events, events)
+            if self._noise.multipliers and not self._document.table["start"]["location"].startswith("start"):
+                entry["multipliers"]["start"] = self._of_noise
+            yield {**entry, "apart": within}
 
     def _is_counted(self, edge: Table) -> bool:
         """Return whether an edge is an event that leaves the loop where the mismatch has a bound."""
         is_live = edge.get("event", False) and edge["to"] is not None
         return bool(is_live) and not str(edge["to"]).startswith("start")
 
+    @property
+    def _of_noise(self) -> Table:
+        """The multipliers that bound We where it is a noise."""
+        return {"facts": {name: quotient(value) for name, value in self._noise.multipliers.items()}}
+
     def _resets(self, location: str) -> list[str]:
         """Return the edges into a location, which are events."""
         return [edge["name"] for edge in self._document.table["edges"] if edge["to"] == location]
 
     def _entry(self, found: Excluded, resets: Sequence[str], edges: Sequence[str]) -> Table:
-        of_noise = {"facts": {name: quotient(value) for name, value in self._noise.multipliers.items()}}
         multipliers: dict[str, Table] = {}
         if self._noise.multipliers:
-            multipliers |= {f"after/{name}": of_noise for name in resets}
+            multipliers |= {f"after/{name}": self._of_noise for name in resets}
         for name in edges:
             facts = {fact: quotient(value) for fact, value in found.facts.items()}
             above = {unit: quotient(value) for unit, value in found.above.items()}

@@ -217,7 +217,7 @@ def test_two_events_are_as_far_apart_as_the_error_needs() -> None:
     """The bounds of the exponential on 64 cells cost a per cent."""
     assert proven(*growing(0.98 * REACHES_2_S)).sentences == [
         "|push| ≤ 1 at all times",
-        "two events are at least 1.07664 s apart",
+        "two events are at least 1.07664 s apart, the start counted as one",
         "the edge 'early' is never taken",
     ]
 
@@ -269,6 +269,11 @@ def start_while_waiting(document: Table, proof: Table) -> None:
     document["start"]["location"] = "waiting"
 
 
+def start_with_more(document: Table, proof: Table) -> None:
+    """The start counts as an event, and is none that resets the error."""
+    document["start"]["columns"][0] = [0.1]
+
+
 def wait_for_a_longer_time(document: Table, proof: Table) -> None:
     document["locations"][1]["clock"] = 1.2
     document["edges"][4]["when"] = [0, 1.2]
@@ -293,6 +298,7 @@ R10_FAULTS: dict[Change, str] = {
     claim_more_growth_is_none: "is not −Rż",
     reach_less: "may reach more within the time",
     arrive_in_the_waiting_location: "waiting is entered without an event",
+    start_with_more: "not proven at the start",
     start_while_waiting: "waiting is entered without an event",
     wait_for_a_longer_time: "may reach more within the time",
     exclude_nothing: "early leads nowhere, and is not proven",
