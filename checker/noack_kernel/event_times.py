@@ -93,8 +93,8 @@ class ResetRows:
     def _verify_apart(self, apart: fmpq) -> None:
         """No event follows another one within ``apart`` once the loop is where the output has a bound.
 
-        If the loop starts there, the start counts as an event. Other edges leave Rz as it is there, and lead to
-        nowhere else.
+        If the loop starts there, the start counts as an event. Other edges leave Rz as it is there, and lead
+        to nowhere else.
         """
         document, inside = self._document, {*self._output.locations}
         if any(edge.duration > 0 for edge in document.edges):
