@@ -24,11 +24,12 @@ from noack_kernel.exact import (
     rational,
     read_matrix,
     square,
+    times_power,
     unit_rows,
     whole,
     zeros,
 )
-from noack_kernel.jumps import Products, Repeat, Step, Steps, duration_of, each_step
+from noack_kernel.jumps import Products, Repeat, Step, Steps, duration_of
 
 FORMAT = "noack-hybrid 1"
 MOST_BYTES = 64 * 2**20
@@ -361,8 +362,10 @@ class Document:
             factor = J.mid[unit, unit] if unit == self.decaying and duration > 0 else fmpq(1)
             if not J.has_row(unit, {unit: factor}):
                 raise RejectedError(f"{place}: a unit changes")
-            if unit == self.decaying and not 0 <= factor <= decay_below(self.rate, duration):
-                raise RejectedError(f"{place}: {self.coordinates[unit]} decays more slowly than at its rate")
+            if unit == self.decaying and not 0 < factor <= decay_below(self.rate, duration):
+                raise RejectedError(
+                    f"{place}: {self.coordinates[unit]} decays more slowly than at its rate, or becomes 0"
+                )
 
     # Steps of edges that last.
 
@@ -387,8 +390,9 @@ class Document:
         if not isinstance(value, dict) or "repeat" not in value:
             return self._step(place, value)
         fields(value, place, {"repeat", "times"})
-        if not isinstance(value["repeat"], list) or (times := whole(value["times"])) < 1:
-            raise RejectedError(f"{place}: repeated are a list of steps, at least once")
+        times = whole(value["times"])
+        if not isinstance(value["repeat"], list) or not value["repeat"] or times < 1:
+            raise RejectedError(f"{place}: repeated are a list of steps, at least one, at least once")
         return Repeat(tuple(self._step(place, each) for each in value["repeat"]), times)
 
     def _step(self, place: str, value: object) -> Step:
@@ -417,10 +421,19 @@ class Document:
                 mid[i, j] = fmpq(int(i == j and i not in self.noise))
                 if radius is not None:
                     radius[i, j] = fmpq(0)
-        for step in each_step(steps):
-            if step.seconds is None and self.decaying is not None:
-                mid[self.decaying, self.decaying] *= step.matrix.mid[self.decaying, self.decaying]
+        if self.decaying is not None:
+            mid[self.decaying, self.decaying] = self._decay_of(steps, self.decaying)
         return Matrix(mid, radius)
+
+    def _decay_of(self, steps: Steps, index: int) -> fmpq:
+        """Return the exact product of what the steps multiply f1 by."""
+        found = fmpq(1)
+        for step in steps:
+            if isinstance(step, Repeat):
+                found = times_power(found, self._decay_of(step.steps, index), step.times)
+            elif step.seconds is None:
+                found = times_power(found, step.matrix.mid[index, index], 1)
+        return found
 
     def _require_time_to_pass(self) -> None:
         """Require that each cycle of edges has an edge that lasts, or a location in which time may pass."""

@@ -71,7 +71,8 @@ class ResetRows:
 
     def _dead_edges(self, names: Sequence[str]) -> list[Edge]:
         edges = {edge.name: edge for edge in self._document.edges if edge.target is None}
-        if not names or (unknown := [name for name in names if name not in edges]):
+        unknown = [name for name in names if name not in edges]
+        if not names or unknown:
             raise RejectedError(f"times: {(unknown or [''])[0][:40]!r} is no edge that leads nowhere")
         return [edges[name] for name in names]
 

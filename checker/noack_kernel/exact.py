@@ -19,6 +19,8 @@ _AROUND_0 = arb(0, _SMALLEST.upper())
 _LARGEST_EXPONENT = 10**15
 """Of e, in which the numbers of a file may be in any unit."""
 _LARGEST_DECAY = 2000
+_MOST_BITS = 100_000
+"""Of exact powers."""
 _DECIMAL = re.compile(r"(-?)([0-9]+)(?:\.([0-9]+))?(?:[eE]([+-]?[0-9]+))?")
 _QUOTIENT = re.compile(r"(-?[0-9]+)/([0-9]+)")
 
@@ -53,6 +55,17 @@ def whole(value: object) -> int:
     if found.q != 1 or found < 0:
         raise RejectedError(f"not a whole number: {found}")
     return int(found.p)
+
+
+def times_power(value: fmpq, base: fmpq, exponent: int) -> fmpq:
+    """Return value · base^exponent.
+
+    Raises:
+        RejectedError: it has too many digits.
+    """
+    if value.height_bits() + base.height_bits() * exponent > _MOST_BITS and base not in (0, 1):
+        raise RejectedError(f"a power has more than {_MOST_BITS} bits")
+    return value * base**exponent
 
 
 class Matrix:

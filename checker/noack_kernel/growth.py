@@ -27,14 +27,17 @@ from noack_kernel.exact import (
     rational,
     read_matrix,
     symmetric,
+    times_power,
     to_balls,
     unit_rows,
 )
 from noack_kernel.forms import visited
+from noack_kernel.jumps import Repeat
 
 MOST_PRODUCTS, LONGEST_PATH = 20_000, 500
 """Of paths of several edges, and their edges."""
 LONGEST_CYCLE = 2000
+_ONE = fmpq(1)
 
 
 class Growth:
@@ -60,6 +63,8 @@ class Growth:
         self.locations, self._edges = visited(document, entry.get("only"))
         if any(location.motion for location in document.locations.values()):
             raise RejectedError("growth: the document has motions")
+        if any(not _is_exact(edge) for edge in document.edges):
+            raise RejectedError("growth: a jump has an interval, in which two runs may differ")
         self._entry = entry
         self.cycle: tuple[str, ...] = ()
         self._homogeneous = [i for i in document.states if i not in document.units]
@@ -68,12 +73,12 @@ class Growth:
         """Verify all inequalities, and return how many; raise RejectedError if one is not proven."""
         return self._verify_forms() if self.is_upper else self._verify_cycle()
 
-    def _power(self, duration: fmpq) -> fmpq:
-        """Return g^{T/U}, where T is a multiple of U."""
+    def _power(self, duration: fmpq, before: fmpq = _ONE) -> fmpq:
+        """Return g^{T/U} times what is before it, where T is a multiple of U."""
         times = duration / self.period
         if times.q != 1 or times > 10**6:
             raise RejectedError("growth: a duration is no multiple of the period")
-        return self.factor ** int(times.p)
+        return times_power(before, self.factor, int(times.p))
 
     # At most.
 
@@ -102,7 +107,7 @@ class Growth:
                     )
                 for each in following:
                     further = from_balls(to_balls(self._state_map(each)) * to_balls(J))
-                    paths.append((each, further, power * self._power(each.duration), length + 1))
+                    paths.append((each, further, self._power(each.duration, power), length + 1))
         return count
 
     def _require_forms(self, forms: Mapping[str, Matrix]) -> None:
@@ -186,7 +191,9 @@ class Growth:
         for location in {edge.source for edge in path}:
             if document.locations[location].facts:
                 raise RejectedError(f"growth: {location!r} has facts")
-        reached, count = {document.start}, 0
+        reached, count = set[str](), -1
+        if not document.locations[document.start].facts:
+            reached = {document.start}
         while len(reached) > count:
             count = len(reached)
             reached |= {str(e.target) for e in document.edges if e.source in reached and self._is_free(e)}
@@ -195,7 +202,9 @@ class Growth:
 
     def _is_free(self, edge: Edge) -> bool:
         """Return whether an edge may be taken by each z, but for bounds of loads, which are 0 here."""
-        return edge.target is not None and all(self._is_of_noise(fact) for fact in edge.facts)
+        if edge.target is None or self._document.locations[edge.target].facts:
+            return False
+        return all(self._is_of_noise(fact) for fact in edge.facts)
 
     def _is_of_noise(self, fact: str) -> bool:
         """Return whether a fact only bounds noise by units, so that it holds where noise is 0."""
@@ -204,6 +213,17 @@ class Growth:
             return False
         units = self._document.units
         return is_positive(Q.take(units, units).times(fmpq(-1)))
+
+
+def _is_exact(edge: Edge) -> bool:
+    """Return whether the file has no interval in the jump or the steps of an edge: all runs have one map."""
+    if not edge.steps:
+        return edge.jump.radius is None
+    return all(
+        one.matrix.radius is None
+        for step in edge.steps
+        for one in (step.steps if isinstance(step, Repeat) else [step])
+    )
 
 
 def _has_eigenvalue_beyond(M: arb_mat, least: fmpq, sign: object) -> bool:

@@ -4,7 +4,7 @@ A row here is Rz with Rż = MRz − y, where y = −Rż + MRz is an output with 
 each location of the bound the row is at most N when the location is entered, and stays below E: with the
 largest value T of the clock, as in :mod:`.event_times`,
 
-    E > g N + I D, or E ≥ N if the row is still: M = 0 and y = 0.
+    E > g N + I D, or E ≥ N if the row is still: M = 0, y = 0, and N does not decay with f1.
 
 N follows at each edge from the facts of the edge, from the bounds in its source, and from one form.
 
@@ -132,6 +132,8 @@ class RowBound:
         else:
             deviation = levels[self.output]
         is_still = self.output is None and all(entry == 0 for entry in self._matrix.mid.entries())
+        if location.motion and within.enter[0] > 0 and self._document.rate > 0:
+            is_still = False  # f1 decays meanwhile
         if is_still and all(most >= enter for enter, most in zip(within.enter, within.within, strict=True)):
             return
         if is_still or location.clock is None:

@@ -95,12 +95,15 @@ class GrowthStatement:
         if self.is_upper:
             verdict = "stable" if self.factor < 1 else "not proven stable"
             return (
-                f"the difference of two runs grows at most by {by} in the long run{_visiting(self.only)}: "
-                f"{verdict}"
+                f"the difference of two runs with the same loads grows at most by {by} in the long run"
+                f"{_visiting(self.only)}: {verdict}"
             )
         verdict = "unstable" if self.factor > 1 else "not proven unstable"
         edges = ", ".join(map(repr, self.cycle))
-        return f"the difference of two runs grows at least by {by}, if these edges repeat: {edges}: {verdict}"
+        return (
+            f"the difference of two runs with the same loads grows at least by {by}, "
+            f"if these edges repeat: {edges}: {verdict}"
+        )
 
 
 def _visiting(only: tuple[str, ...] | None) -> str:

@@ -116,7 +116,9 @@ def test_eleven_losses_in_a_row_are_stable_and_twelve_are_not() -> None:
     _, (least, _) = proven(*growing(12))
     assert not least.is_upper
     assert least.factor > 1
-    assert str(least).startswith("the difference of two runs grows at least by the factor 1.002")
+    assert str(least).startswith(
+        "the difference of two runs with the same loads grows at least by the factor 1.002"
+    )
     letters = {"early": "E", "late": "L", "lost": "X"}
     outcomes = "".join(letters[name.split(", ")[1]] for name in least.cycle)
     rounds = 2000 // len(outcomes)
@@ -133,8 +135,8 @@ def test_a_smaller_part_of_a_document_has_statements_of_its_own() -> None:
     assert entry is not None
     _, (growth,) = proven(document, proof_of(growth=[entry]))
     assert str(growth) == (
-        "the difference of two runs grows at most by the factor 0.88 per 0.01 s in the long run, for "
-        "runs that visit only '0 lost', '1 lost': stable"
+        "the difference of two runs with the same loads grows at most by the factor 0.88 per 0.01 s in the "
+        "long run, for runs that visit only '0 lost', '1 lost': stable"
     )
     with pytest.raises(RejectedError, match="not proven of paths"):
         proven(document, proof_of(growth=[entry | {"only": [*kept, "2 lost", "3 lost"]}]))
@@ -296,6 +298,21 @@ def forget_noise_during_edges(document: Table, proof: Table) -> None:
             del proof["bounds"][0]["multipliers"][name]
 
 
+def let_a_unit_become_0(document: Table, proof: Table) -> None:
+    """Where f1 is 0, nothing is below it, and an edge whose facts need |x| ≥ f1 may be taken with x = 0."""
+    step(document, "period")[column(document, "f1")][column(document, "f1")] = 0
+
+
+def repeat_nothing(document: Table, proof: Table) -> None:
+    """So often that it takes long."""
+    document["edges"][0]["jump"].append({"repeat": [], "times": 10**12})
+
+
+def multiply_a_unit_often(document: Table, proof: Table) -> None:
+    """Its exact number would have millions of digits."""
+    document["edges"][0]["jump"].append({"repeat": ["period"], "times": 90_000})
+
+
 def visit_other_places(document: Table, proof: Table) -> None:
     """The start is not among them."""
     bound = proof["bounds"][0]
@@ -339,6 +356,9 @@ FAULTS: dict[Change, str] = {
     have_no_spread: "the spread is not above 0",
     use_a_large_spread: "not proven at during/",
     forget_noise_during_edges: "not proven at during/",
+    let_a_unit_become_0: "or becomes 0",
+    repeat_nothing: "at least one, at least once",
+    multiply_a_unit_often: "a power has more than",
     visit_other_places: "no run starts",
 }
 
@@ -414,6 +434,27 @@ def be_out_of_reach(document: Table, proof: Table) -> None:
     proof["growth"].pop(1)
 
 
+def be_out_of_reach_by_facts(document: Table, proof: Table) -> None:
+    """No run is ever where the document's runs begin: f2 is not 0."""
+    document["rows"]["f2"] = [[int(c["name"] == "f2") for c in document["coordinates"]]]
+    document["facts"]["no"] = {"less": ["f2"], "more": [], "words": "never"}
+    before = document["locations"][0] | {"name": "before", "facts": ["no"]}
+    document["locations"].append(before)
+    document["start"]["location"] = "before"
+    document["edges"].append(document["edges"][0] | {"name": "begin", "from": "before"})
+    proof["growth"].pop(1)
+
+
+def be_left_to_chance(document: Table, proof: Table) -> None:
+    """The difference of two runs does not vanish if they may differ in an entry."""
+    step(document, "tick")[column(document, "integral")][column(document, "f2")] = [0, 1]
+
+
+def take_a_tiny_period(document: Table, proof: Table) -> None:
+    """The power of the factor would have millions of digits."""
+    proof["growth"][1]["period"] = 0.00000001
+
+
 def turn_the_sign(document: Table, proof: Table) -> None:
     entry = proof["growth"][0]
     if "sign" in entry:
@@ -442,6 +483,9 @@ FAULTS_OF_GROWTH: dict[Change, str] = {
     have_no_edge: "in the cycle",
     need_a_fact: "has facts, or is not reached",
     be_out_of_reach: "has facts, or is not reached",
+    be_out_of_reach_by_facts: "not reached from the start",
+    be_left_to_chance: "a jump has an interval",
+    take_a_tiny_period: "a power has more than",
     turn_the_sign: "not proven to grow",
     leave_out_the_vector: "positive or negative",
     miss_a_tick: "growth",

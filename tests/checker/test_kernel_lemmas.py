@@ -283,6 +283,10 @@ def exclude_nothing(document: Table, proof: Table) -> None:
     del proof["times"][1]
 
 
+def exclude_no_edge(document: Table, proof: Table) -> None:
+    proof["times"][1]["never"] = []
+
+
 def leave_out_the_margin(document: Table, proof: Table) -> None:
     proof["times"][0]["multipliers"]["edge/lost"] = {"facts": {"exceeded": 1}}
 
@@ -302,6 +306,7 @@ R10_FAULTS: dict[Change, str] = {
     start_while_waiting: "waiting is entered without an event",
     wait_for_a_longer_time: "may reach more within the time",
     exclude_nothing: "early leads nowhere, and is not proven",
+    exclude_no_edge: "is no edge that leads nowhere",
     leave_out_the_margin: "not proven to be never taken",
 }
 
@@ -507,3 +512,45 @@ def test_a_bound_of_rows_that_is_not_proven_is_rejected(change: Change) -> None:
     change(document, proof)
     with pytest.raises(RejectedError, match=R11_FAULTS[change]):
         proven(document, proof)
+
+
+# A row that is still, with a bound that decays.
+
+
+def still(most: float = 1.001, rate: float = 1.0, moves: bool = True) -> tuple[Table, Table]:
+    """Return ẋ = 0, x(0) = 1, and the proof of |x| ≤ f1 · √most for one second."""
+    document: Table = {
+        "format": "noack-hybrid 1", "name": "still",
+        "coordinates": [{"name": "x", "unit": ""}, {"name": "f1", "unit": ""}],
+        "decaying": {"coordinate": "f1", "rate": rate}, "rows": {}, "facts": {},
+        "motions": {"m": [{"matrix": [[0, 0], [0, -rate]], "input": [], "unknown": []}]},
+        "locations": [
+            {
+                "name": "a", "coordinates": ["x"], "facts": [],
+                **({"motion": "m", "clock": 1} if moves else {"motion": None}),
+            }
+        ],
+        "edges": [],
+        "start": {"location": "a", "columns": [[1], [1]], "facts": []},
+        "outputs": [{"name": "x", "unit": "", "rows": [[1, 0]], "in": ["a"]}],
+    }  # fmt: skip
+    bound = {
+        "output": "x", "from": "start", "decay": 0, "levels": [1.0001 * most, 0], "matrices": {},
+        "forms": {"a": {"nodes": [0], "terms": [[]]}},
+        "multipliers": {"output/a/0": {"facts": {"of x": 1}}},
+    }  # fmt: skip
+    rows = {
+        "name": "of x", "rows": [[1, 0]], "matrix": [[0]],
+        "in": {"a": {"enter": [1.0005, 0], "within": [most, 0]}}, "multipliers": {},
+    }  # fmt: skip
+    return document, {"format": "noack-forms 1", "bounds": [bound], "rows": [rows]}
+
+
+def test_a_row_that_is_still_does_not_decay() -> None:
+    with pytest.raises(RejectedError, match="of x in a: it may exceed the bound"):
+        proven(*still())
+    with pytest.raises(RejectedError, match="of x in a: it may exceed the bound"):
+        proven(*still(0.99 * math.exp(2)))
+    assert proven(*still(1.02 * math.exp(2))).bounds
+    assert proven(*still(rate=0)).bounds
+    assert proven(*still(moves=False)).bounds
