@@ -38,6 +38,8 @@ MOST_PRODUCTS, LONGEST_PATH = 20_000, 500
 """Of paths of several edges, and their edges."""
 LONGEST_CYCLE = 2000
 _ONE = fmpq(1)
+_MOST_BITS = 512
+"""Of the power of the factor over a path; a longer one is rounded down."""
 
 
 class Growth:
@@ -107,7 +109,8 @@ class Growth:
                     )
                 for each in following:
                     further = from_balls(to_balls(self._state_map(each)) * to_balls(J))
-                    paths.append((each, further, self._power(each.duration, power), length + 1))
+                    longer = _short(self._power(each.duration, power))
+                    paths.append((each, further, longer, length + 1))
         return count
 
     def _require_forms(self, forms: Mapping[str, Matrix]) -> None:
@@ -213,6 +216,11 @@ class Growth:
             return False
         units = self._document.units
         return is_positive(Q.take(units, units).times(fmpq(-1)))
+
+
+def _short(power: fmpq) -> fmpq:
+    """Return a number that is at most a power of the factor, close to it, and has few digits."""
+    return power if power.height_bits() <= _MOST_BITS else arb(power).lower().fmpq()
 
 
 def _is_exact(edge: Edge) -> bool:
