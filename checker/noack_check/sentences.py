@@ -58,11 +58,6 @@ def at_least(value: arb | fmpq) -> str:
     return _rounded(value.lower() if value.rad() != 0 else value, ROUND_FLOOR)
 
 
-def _is_zero(value: arb) -> bool:
-    """Return whether a number is exactly 0; a ball around 0 is not."""
-    return bool(value == 0)
-
-
 def _rounded(value: arb | fmpq, rounding: str) -> str:
     exact, text = value if isinstance(value, fmpq) else value.mid().fmpq(), repr(float(value))
     if len(text) <= _SHORT and isfinite(float(value)):

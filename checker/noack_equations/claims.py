@@ -284,8 +284,9 @@ def _require_enclosed(claim: Claim, plants: LinearPlants) -> None:
             room = half.mid[i, k] - arb(found_half[i, k].upper()).fmpq()
             if not _contains(M, i, k, found[i, k], room):
                 raise RejectedError(f"equations: the slope {name}[{i}, {k}] is not within what is claimed")
-    if plants.pushes.ncols() != len(claim.signals):
-        raise RejectedError(f"equations: {plants.pushes.ncols()} signals, of which the document has others")
+    found_signals, signals = plants.pushes.ncols(), len(claim.signals)
+    if found_signals != signals:
+        raise RejectedError(f"signals: the equations have {found_signals}, the document has {signals}")
     for k, (signal, along) in enumerate(zip(claim.signals, plants.along, strict=True)):
         for i in range(claim.n):
             if not _contains(signal.column, i, 0, plants.pushes[i, k], fmpq(0)):
@@ -416,4 +417,4 @@ def _require(M: Matrix, i: int, j: int, needed: Matrix, row: int, column: int, p
     radius = fmpq(0) if M.radius is None else M.radius[i, j]
     size = fmpq(0) if needed.radius is None else needed.radius[row, column]
     if abs(M.mid[i, j] - needed.mid[row, column]) + size > radius:
-        raise RejectedError(f"{place} is not that of the equations")
+        raise RejectedError(f"{place} does not contain the interval that the equations give")

@@ -208,7 +208,7 @@ class Document:
         self.noise = self._read_noise(table["noise"])
         self.rate = size(table["rate"], "rate")
         if self.rule.level > 0 and self.rate > self.rule.rate:
-            raise RejectedError("rate: above that of the threshold")
+            raise RejectedError("rate: it is larger than the rate of the threshold")
         self.outputs = self._read_outputs(table["outputs"])
         self.limits = [self._read_limit(each) for each in entries(table.get("while", []), "while")]
         self.equations = self._read_equations(table.get("equations"))

@@ -93,7 +93,7 @@ def _times(d: Document) -> Iterator[str]:
     if d.until is not None:
         yield f"all this is so up to t = {_number(d.until)} s"
     if d.offset > 0:
-        yield f"the state that outputs are of is at most {_number(d.offset)} from x"
+        yield f"the outputs are computed from a state that differs from x by at most {_number(d.offset)}"
 
 
 def _noise(d: Document) -> Iterator[str]:

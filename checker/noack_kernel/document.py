@@ -345,7 +345,7 @@ class Document:
         steps = self._steps(place, entry.get("jump"))
         duration = duration_of(steps)
         if rational(entry.get("duration", fmpq(0))) != duration:
-            raise RejectedError(f"{place}: the duration is not that of its steps")
+            raise RejectedError(f"{place}: the duration is not the sum of its steps")
         J = self._product(steps) if steps else read_matrix(entry.get("jump"), self.size, self.size)
         self._require_jump(place, J, duration, self.locations[source], self.locations[target])
         return Edge(name, source, target, first, last, str(entry["clock"]), facts, J, event, steps, duration)

@@ -63,7 +63,7 @@ def _edge_text(failure: FailurePart) -> str:
 def _clock_text(failure: FailurePart) -> str:
     at, found, high = failure.at, _time(failure.found_s), _time(failure.high_s)
     if at is None or failure.kind is Failed.CLOCK:
-        return f"the clock of {failure.place!r} is another one than that of the record"
+        return f"the clock of {failure.place!r} differs from the clock of the record"
     if failure.found_s is not None and failure.low_s is not None and failure.found_s < failure.low_s:
         return f"a test came {found} after the one before, at least {_time(failure.low_s)} are required"
     if at.waits and at.starts:

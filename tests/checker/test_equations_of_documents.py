@@ -122,7 +122,7 @@ FALSE: dict[str, tuple[Callable[[Table, str], str], str]] = {
     ),
     "a constant more": (
         lambda d, e: with_digest(d, e.replace("dx_1/dt = x_2", "s_20 = x_2 + 0.001\ndx_1/dt = s_20")),
-        "1 signals, of which the document has others",
+        "signals: the equations have 1, the document has 0",
     ),
     "another hash": (of_claim("sha256", "0" * 64), "and the file has others"),
     "no hash": (of_claim("sha256", "0"), "not 64 hexadecimal digits"),
@@ -139,22 +139,22 @@ FALSE: dict[str, tuple[Callable[[Table, str], str], str]] = {
     "a negative half-width": (of_claim("half_B", [[0], [-1]]), "not below 0"),
     "a plant that the motions do not have": (
         lambda d, e: entry(d["equations"]["A"], 0, 1, lambda low, high: [0.99, 1.01]) or e,
-        "the row of 'angle' is not that",
+        "the row of 'angle' does not contain the interval",
     ),
     "a motion with another row": (
         in_all_corners(lambda c: entry(c["matrix"], 1, 1, lambda low, high: float(low) * 1.01)),
-        "the row of 'rate' is not that",
+        "the row of 'rate' does not contain the interval",
     ),
     "a motion without its signal": (
         in_all_corners(lambda c: c["unknown"].clear()), "fewer unknown signals than the equations have",
     ),
     "a signal with a smaller row": (
         in_all_corners(lambda c: entry(c["unknown"][0]["rows"], 0, 0, lambda low, high: 0.99 * float(low))),
-        r"the entry A\[1, 0\] is not that",
+        r"the entry A\[1, 0\] does not contain the interval",
     ),
     "a signal that does not move the error": (
         in_all_corners(lambda c: c["unknown"][0]["column"].__setitem__(3, [0])),
-        r"the entry A\[1, 0\] is not that",
+        r"the entry A\[1, 0\] does not contain the interval",
     ),
     "an edge that changes a state": (
         lambda d, e: d["edges"][0]["jump"][0].__setitem__(0, 0.99) or e, "it changes the state 'angle'",
@@ -189,13 +189,13 @@ FALSE_FRICTION: dict[str, tuple[Callable[[Table], object], str]] = {
         lambda d: d["equations"]["signals"][0].update(along=[[0, [499, 501], [-1, 1]]]),
         "which is a mixture|a mixture of inputs",
     ),
-    "no friction": (lambda d: d["equations"]["signals"].clear(), "of which the document has others"),
+    "no friction": (lambda d: d["equations"]["signals"].clear(), "signals: the equations have"),
     "a motion whose friction takes more": (
         lambda d: [c["unknown"][0].update(least=2) for c in corners(d)], "so much",
     ),
     "a motion with less friction": (
         lambda d: [entry(c["unknown"][0]["column"], 1, 0, lambda low, high: -0.99) for c in corners(d)],
-        "the signal 0 is not that",
+        "the signal 0 does not contain the interval",
     ),
 }  # fmt: skip
 

@@ -119,7 +119,7 @@ def test_any_number_of_later_events_is_covered() -> None:
 
 REJECTED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "a rate that is too large": (lambda document: document.update(rate=0.24999), "inter_event_s"),
-    "a rate above that of the threshold": (lambda document: document.update(rate=0.26), "rate: above"),
+    "a rate above that of the threshold": (lambda document: document.update(rate=0.26), "rate: it is larger"),
     "a time between events that is too long": (
         lambda document: document["gains"].update(inter_event_s=1.05 * document["gains"]["inter_event_s"]),
         "inter_event_s",

@@ -79,7 +79,7 @@ def test_a_document_in_words_has_its_numbers() -> None:
         "with ‖W n‖ ≤ 0.002",
         "an event needs ‖(e x0)‖ above the larger of 0.1 e^(−0.25 t) or 0.05",
         "while no input acts, [0.02] is added to dx/dt",
-        "the state that outputs are of is at most 0.001 from x",
+        "the outputs are computed from a state that differs from x by at most 0.001",
     ):
         assert part in words, words
 
@@ -150,7 +150,7 @@ REJECTED: dict[str, tuple[Callable[[Table, Table], object], str]] = {
     "a gain that is an interval": (lambda d, p: d["gain"][0].__setitem__(0, [0, 1]), "an interval"),
     "an interval the wrong way": (lambda d, p: d["A"][0].__setitem__(0, [1, 0]), "not two ends"),
     "an output twice": (lambda d, p: d["outputs"].append(d["outputs"][0]), "occurs twice"),
-    "a rate above the threshold's": (lambda d, p: d.update(rate=2 * d["rule"]["rate"]), "rate: above"),
+    "a rate above the threshold's": (lambda d, p: d.update(rate=2 * d["rule"]["rate"]), "rate: it is larger"),
     "a rule without a comparison": (lambda d, p: d["rule"].update(compared=[]), "compares nothing"),
     "tests further apart": (lambda d, p: d["times"].update(least_sampling=9), "tests further apart"),
     "a limit of nothing": (lambda d, p: d.update({"while": [{"output": "y", "less": 1}]}), "while: no such"),

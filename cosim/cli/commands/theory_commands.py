@@ -124,7 +124,7 @@ def certify(
     if out is not None:
         require_suffix(out, "--out", ".mat")
     if equations is not None and document is None:
-        raise CallerError("--equations: they are those of a document; add --document FILE and --proof FILE")
+        raise CallerError("--equations: they belong to a document; add --document FILE and --proof FILE")
     if (document is None) != (proof is None):
         raise CallerError("--document and --proof: noack-check needs both files; add the other option")
     loaded = opt.load_loop(scenario, settings, loop, network)
