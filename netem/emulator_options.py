@@ -18,7 +18,6 @@ from noack.impairments.target_loss import read_files
 from noack.impairments.words import OWN_TIME_S
 from noack.runtime.address import parse_address, parse_destination
 from noack.runtime.command_line import Parser
-from noack.runtime.join_run import add_options
 from noack.settings.section import LARGEST_SEED
 
 LINK_NAME = "relay"
@@ -108,17 +107,14 @@ def command_line_parser() -> Parser:
         "       %(prog)s --links FILE.toml [options]\n"
         "       %(prog)s --explain WORDS ...\n"
         "       %(prog)s shell [WORDS ...] [options] [-- COMMAND]\n"
-        "       %(prog)s show|set|watch [NAME] ...\n"
-        "       %(prog)s [--session NAME]",
+        "       %(prog)s show|set|watch [NAME] ...",
         description="A UDP relay that emulates a network, configured in the syntax of `tc netem`. "
-        "With mansd N, at most N consecutive datagrams of a flow are lost. Without --listen, it "
-        "joins the run that `noack record SCENARIO` has opened.",
+        "With mansd N, at most N consecutive datagrams of a flow are lost.",
         epilog=_EPILOG.format(grammar="\n  ".join(GRAMMAR)),
         formatter_class=_Formatter,
         allow_abbrev=False,
     )
-    add_options(parser)
-    # An emulator on its own.
+    parser.add_argument("--json", action="store_true", help="print the final report as JSON")
     links = parser.add_argument_group("links")
     _add_words(links, "clients", "server")
     links.add_argument(
@@ -187,18 +183,12 @@ def parse_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> 
     """Return the options of a command line.
 
     Raises:
-        CallerError: a word begins with dashes, or --session is combined with other options.
+        CallerError: a word begins with dashes, or an option is unknown.
     """
     require_no_dashes(arguments)
     # With a space before it, argparse takes -1,2 for a word, not for an option.
     words = [f" {argument}" if re.match(r"-[0-9.]", argument) else argument for argument in arguments]
-    options = parser.parse_intermixed_args(words)
-    if any(argument.partition("=")[0] == "--session" for argument in arguments):
-        raise CallerError(
-            "--session joins a run and allows only --json beside it; words and all other options "
-            "belong to an emulator on its own, which needs --listen and --to, or --links"
-        )
-    return options
+    return parser.parse_intermixed_args(words)
 
 
 def specs_of(options: argparse.Namespace, *, read: bool = True) -> tuple[LinkSpec, ...]:

@@ -13,7 +13,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from netem.control.command_queue import CommandQueue
-from netem.control.control_server import ControlServer
 from netem.control.emulator_statistics import Statistics, StatisticsThread
 from netem.relay.relay import Relay
 from netem.relay.relay_reports import report_line
@@ -76,6 +75,8 @@ def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[CommandQu
         if options.stats is not None:
             stack.enter_context(_statistics_lines(commands, options.stats, options.stats_file))
         if options.control is not None:
+            from netem.control.control_server import ControlServer  # imports zenoh
+
             stack.enter_context(ControlServer(options.control, commands))
         stack.callback(commands.close)
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())

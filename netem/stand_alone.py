@@ -25,7 +25,7 @@ from netem.relay_watch import add_watching_options, check_watching_options, watc
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.core.number_format import counted
 from noack.runtime.address import address_text
-from noack.runtime.command_line import Signals, log_event, log_format, report_failure
+from noack.runtime.command_line import Parser, Signals, log_event, log_format, report_failure
 from noack.runtime.drivers.realtime_settings import realtime
 
 _FIFO_PRIORITY = 50
@@ -63,7 +63,7 @@ def add_relay_options(parser: argparse.ArgumentParser, *, shell: bool = False) -
     add_watching_options(parser)
 
 
-def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
+def run_stand_alone(arguments: Sequence[str], parser: Parser | None = None) -> ExitStatus:
     """Run a stand-alone emulator until Ctrl-C, or explain its settings; print the totals.
 
     Returns:
@@ -72,7 +72,7 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
     Raises:
         CallerError: the command line has a mistake.
     """
-    parser = command_line_parser()
+    parser = parser or command_line_parser()
     add_relay_options(parser)
     options = parse_options(parser, arguments)
     specs = specs_of(options)

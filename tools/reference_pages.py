@@ -16,7 +16,7 @@ from unittest.mock import patch
 from typer.main import get_command
 
 from cosim.cli.application import app
-from netem.__main__ import main as netem_main
+from noack.network_process.__main__ import main as netem_main
 
 ROOT = Path(__file__).parents[1]
 _MARK = re.compile(r"^<!-- made: ([a-z_ ]+) -->$", re.MULTILINE)

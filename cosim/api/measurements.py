@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from cosim.api.scenarios import Source, load
-from cosim.measurement.certificate_time import CertificateTime
+from cosim.measurement.certificate_time import CertificateTime, measured_certificate_time
 from cosim.measurement.loss_bursts import WINDOWS
 from cosim.measurement.measurement_outputs import measurement_document
 from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
@@ -40,7 +40,7 @@ class Measurement(NetworkMeasurement):
         Raises:
             NoackError: the scenario is wrong, has several loops, or the delays are not known.
         """
-        return super().certificate_time(load(scenario))
+        return measured_certificate_time(self, load(scenario))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the page of tables and figures (``.html``).

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S, RunClock
-from noack.protocol.roles import Notice, Record
+from noack.protocol.roles import LOOP_ROLES, Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Wire
 from noack.runtime.drivers.live_driver import LiveDriver
 from noack.runtime.drivers.real_time_loop import RecordSink, run_loop
@@ -30,7 +30,7 @@ def wake(
     Returns:
         ``late_ns``: lateness of each wake-up; ``settings``: which real-time settings are applied.
     """
-    with realtime(is_realtime, priority, place=0) as settings:
+    with realtime(is_realtime, priority, place=0, places=len(LOOP_ROLES)) as settings:
         return {"late_ns": idle_lateness_ns(period_ns, duration_s, spin_us), "settings": settings}
 
 

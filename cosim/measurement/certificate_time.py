@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.observed_conditions import PacketLosses
 from cosim.analysis.claims.run_certificates import scheduled_certificates
 from cosim.measurement.loss_bursts import Outcomes, outcomes
+from cosim.measurement.network_measurement import NetworkMeasurement
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import NetworkConditions, allowed_conditions, network_delay_ns
@@ -90,6 +91,12 @@ class CertificateTime:
     def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
         return asdict(self) | {"first_s": self.first_s, "answer": self.answer}
+
+
+def measured_certificate_time(measurement: NetworkMeasurement, scenario: Scenario) -> CertificateTime:
+    """As :func:`certificate_time`; raise CallerError also if the delays are not known."""
+    measurement.require_delays("a scenario's certificate (--for)")
+    return certificate_time(measurement.trace, scenario)
 
 
 def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosim.live.monitoring.progress import activity
-from cosim.measurement.certificate_time import CertificateTime
+from cosim.measurement.certificate_time import CertificateTime, measured_certificate_time
 from cosim.measurement.interval_estimates import LEVEL, IntervalEstimate
 from cosim.measurement.loss_bursts import histogram, most_losses
 from cosim.measurement.network_measurement import NetworkMeasurement
@@ -60,7 +60,7 @@ def write_outputs(measurement: NetworkMeasurement, request: OutputRequest) -> tu
         NoackError: one line; a file cannot be written, or the scenario cannot be resolved.
     """
     with activity("measuring"):
-        void = None if request.scenario is None else measurement.certificate_time(request.scenario)
+        void = None if request.scenario is None else measured_certificate_time(measurement, request.scenario)
         document = measurement_document(measurement, void)
     written: list[Path] = []
     if request.page is not None:

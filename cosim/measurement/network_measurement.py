@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.special import ndtri
 
-from cosim.measurement.certificate_time import CertificateTime, certificate_time
 from cosim.measurement.chain_fits import MOST_FITTED, ChainFit, ChainFits, FitTest
 from cosim.measurement.interval_estimates import LEVEL, IntervalEstimate
 from cosim.measurement.loss_bursts import (
@@ -36,7 +35,6 @@ from noack.impairments.burst_prediction import (
     read_within,
 )
 from noack.impairments.loss_prediction import LossProcess
-from noack.scenario.scenario import Scenario
 from noack.traces.packet_trace import PacketTrace
 
 Reals = NDArray[np.float64]
@@ -348,15 +346,6 @@ class NetworkMeasurement:
         """The model of the outages."""
         durations_s = self.bursts.times_s(self.trace)[1][self.is_outage]
         return fit_outages(durations_s, self.bursts.complete[self.is_outage], self.observed_s)
-
-    def certificate_time(self, scenario: Scenario) -> CertificateTime:
-        """Return for which share of the time a scenario's certificates would have been void.
-
-        Raises:
-            CallerError: the delays are not known.
-        """
-        self.require_delays("a scenario's certificate (--for)")
-        return certificate_time(self.trace, scenario)
 
     @cached_property
     def remarks(self) -> list[str]:

@@ -1,7 +1,6 @@
 """Packet traces from all that can be measured.
 
-The sources are files of known formats, run directories (the updates, from the emulator to the
-controller), and the delivery opportunities of mahimahi. The latter say when the link could deliver,
+The sources are files of known formats, and the delivery opportunities of mahimahi. The latter say when the link could deliver,
 and nothing about losses. So their trace is that of a simulated probe through the emulator's link:
 its delays are those of waiting for the next opportunity.
 """
@@ -15,8 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cosim.record.run_events import packet_outcomes
-from cosim.record.run_record import RunRecord, load_record
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
@@ -25,7 +22,6 @@ from noack.core.file_access import open_regular
 from noack.core.number_checks import real_number, whole_number
 from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.record_tables import CONTROLLER_DELIVERY
 from noack.settings.user_files import NamedFile
 from noack.traces.capture_packets import is_capture
 from noack.traces.capture_trace import CaptureFileError, CaptureOptions, read_captures
@@ -48,7 +44,7 @@ _HEAD_BYTES = 64
 """Bytes by which a file is recognised."""
 USUAL_PERIOD_NS = 20_000_000
 _SHORTEST_PERIOD_S, _LONGEST_PERIOD_S = 50e-6, 3600.0
-_OTHER_SOURCES = ("run directories", "delivery opportunities")
+_OPPORTUNITIES = "delivery opportunities"
 
 
 @dataclass(frozen=True)
@@ -119,8 +115,12 @@ def refuse_unused(options: "DataclassInstance", names: Mapping[str, str], source
             raise CallerError(f"{names[field.name]}: has no effect on {source}")
 
 
-def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> PacketTrace:
+def read_files(
+    paths: Sequence[Path], options: SourceOptions | None = None, others: Sequence[str] = ()
+) -> PacketTrace:
     """Return the packet trace in a file, or in the captures of the sender's and receiver's ends.
+
+    ``others`` are further kinds of sources that the caller reads, for the message about a wrong file.
 
     Raises:
         NoackError: one line; it cannot be read, or is not a trace.
@@ -128,9 +128,6 @@ def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> 
     if not paths:
         raise CallerError("no file is given; give a packet trace, or the name of a shipped one")
     options, first_path = options or SourceOptions(), paths[0]
-    if len(paths) == 1 and first_path.is_dir():
-        refuse_unused(options, FILE_OPTIONS, "a run directory")
-        return read_run(first_path)
     heads = [_head(path) for path in paths]
     if all(map(is_capture, heads)) and len(paths) < 3:
         refuse_unused(options, FILE_OPTIONS, "captures", *_CAPTURE_OPTIONS)
@@ -148,7 +145,7 @@ def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> 
         refuse_unused(options, FILE_OPTIONS, "delivery opportunities", "period_ns")
         return read_opportunities(first_path, options.period_ns)
     refuse_unused(options, FILE_OPTIONS, "a packet trace", "clocks_differ")
-    return read_trace(first_path, clocks_differ=bool(options.clocks_differ), others=_OTHER_SOURCES)
+    return read_trace(first_path, clocks_differ=bool(options.clocks_differ), others=(*others, _OPPORTUNITIES))
 
 
 def _head(path: Path) -> bytes:
@@ -179,41 +176,6 @@ def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace
         raise CallerError(f"{paths[error.place]}: {one_line(error)}") from None
     except FILE_ERRORS as error:
         raise CallerError(f"{', '.join(map(str, paths))}: {file_problem(error)}") from None
-
-
-def read_run(run_dir: Path) -> PacketTrace:
-    """Return the trace of a run's updates.
-
-    Raises:
-        NoackError: it is not a run, or has no updates.
-    """
-    try:
-        return updates_trace(load_record(run_dir))
-    except ValueError as error:
-        raise CallerError(f"{run_dir}: {error}") from None
-
-
-def updates_trace(record: RunRecord) -> PacketTrace:
-    """Return the trace of the updates: sent when they reached the emulator.
-
-    Updates that were in flight at the end are left out. Raise ValueError if there are none.
-    """
-    outcomes = packet_outcomes(record)
-    arrived = record.columns(CONTROLLER_DELIVERY, "sequence", "now_ns")
-    numbers, first_row = np.unique(arrived["sequence"], return_index=True)
-    received_ns = np.full(len(outcomes.sequence), LOST_NS)
-    if len(numbers):
-        row = np.minimum(np.searchsorted(numbers, outcomes.sequence), len(numbers) - 1)
-        has_arrived = numbers[row] == outcomes.sequence
-        received_ns[has_arrived] = arrived["now_ns"][first_row[row[has_arrived]]]
-    sent_ns, lost = outcomes.now_ns, received_ns == LOST_NS
-    ended = ~(outcomes.in_flight & lost)
-    if not ended.any():
-        raise ValueError("no updates reached the network emulator")
-    trace = packet_trace(sent_ns[ended], np.maximum(received_ns, sent_ns)[ended], lost[ended])
-    in_flight = int((~ended).sum())
-    notes = [f"left out: {in_flight} updates in flight at the end"] if in_flight else []
-    return trace.noted("the updates of the run, from emulator to controller", *notes)
 
 
 _LINES = re.compile(rb"(?:[0-9]{1,15}[ \t]*\r?\n)+[0-9]{0,15}")

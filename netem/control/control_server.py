@@ -1,17 +1,14 @@
-"""Live control of a running emulator: its file, by which commands find it, and its queries.
+"""Live control of a running emulator by zenoh: its queries.
 
-While an emulator runs, its file is in the user's runtime directory
-(:mod:`noack.runtime.private_folder`), beside the Unix socket on which it listens, which only its
-user can reach. Below ``netem/NAME`` it answers ``report``, ``settings`` and ``change``, and
+It listens on a Unix socket beside its file (:mod:`netem.control.running_emulators`). Below ``netem/NAME`` it answers ``report``, ``settings`` and ``change``, and
 publishes ``statistics`` once a second, as docs/netem-control.md describes, in a thread of its own.
 A query with a mistake is answered with one line, and changes nothing.
 """
 
 import json
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from typing import Literal, Self
 
 import zenoh
@@ -21,98 +18,15 @@ from zenoh.handlers import RingChannel
 
 from netem.control.command_queue import CommandQueue
 from netem.control.emulator_statistics import Statistics, StatisticsThread
+from netem.control.running_emulators import EMULATORS, registered_emulator
 from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of, words_of
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.core.json_text import parse_json
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import with_target_loss
-from noack.runtime import private_folder
 from noack.runtime.connections.zenoh_session import cause_of, open_session
-from noack.runtime.private_folder import require_name
 from noack.scenario.toml_file import brief
-
-EMULATORS = "netem"
-"""The folder of the files."""
-_STARTING = "netem_starting"
-"""The folder of the files of emulators that start."""
-
-
-def _in_use(name: str) -> CallerError:
-    return CallerError(f"--control {name}: an emulator of this name runs; choose another name")
-
-
-@contextmanager
-def registered_emulator(name: str, folder: str = EMULATORS) -> Iterator[Path]:
-    """Keep an emulator's file within the context.
-
-    Raises:
-        CallerError: the name is not allowed or in use, or the folder is not the user's own.
-    """
-    require_name(name, "emulator")
-    with ExitStack() as stack:
-        try:
-            path = stack.enter_context(private_folder.lock_file(folder, name, {}))
-        except FileExistsError:
-            raise _in_use(name) from None
-        yield path
-
-
-@contextmanager
-def starting(name: str | None) -> Iterator[None]:
-    """Publish within the context that an emulator of this name, if any, starts.
-
-    Raises:
-        CallerError: the name is not allowed or in use, or the folder is not the user's own.
-    """
-    if name is None:
-        yield
-        return
-    with registered_emulator(name, _STARTING):
-        if name in running_emulators():
-            raise _in_use(name)
-        yield
-
-
-def running_emulators() -> list[str]:
-    """Return the names of this user's emulators that accept commands.
-
-    Raises:
-        CallerError: other users have access to the folder.
-    """
-    return list(_files())
-
-
-def find_emulator(name: str | None) -> str:
-    """Return the name of a running emulator; if ``name`` is None, of the only one.
-
-    Raises:
-        CallerError: there is no such emulator, or several run and none is named.
-        PeerError: it is still starting.
-    """
-    files = _files()
-    starting_names = [file.path.stem for file in private_folder.live_lock_files(_STARTING)]
-    if name not in files and (name in starting_names or (name is None and starting_names and not files)):
-        raise PeerError(
-            f"emulator {name or starting_names[0]!r} is starting; "
-            "it prints `ready` on standard output when it accepts commands"
-        )
-    if not files:
-        name_text = "" if name is None else f" {name!r}"
-        raise CallerError(
-            f"no emulator{name_text} accepts commands; start one with `noack netem --control NAME …`"
-        )
-    if name is None and len(files) > 1:
-        raise CallerError(f"which emulator? Running: {', '.join(files)}")
-    name = name or next(iter(files))
-    if name not in files:
-        raise CallerError(f"no emulator {name!r}; running: {', '.join(files)}")
-    return name
-
-
-def _files() -> dict[str, private_folder.LockFile]:
-    return {file.path.stem: file for file in private_folder.live_lock_files(EMULATORS)}
-
 
 _PUBLISH_S = 1.0
 """Time between two published statistics."""

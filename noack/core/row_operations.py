@@ -8,7 +8,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix, Vector
+Matrix = Vector = NDArray[np.float64]
 
 _SMALLEST_SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""

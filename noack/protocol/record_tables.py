@@ -9,13 +9,13 @@ nominal, ``now_ns`` actual.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import astuple, dataclass
-from enum import IntEnum
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, PACKET_HEAD_BYTES, Fate
 from noack.protocol.wire_format import Flow
 
 PLANT_STEP = "plant_step"
@@ -24,8 +24,6 @@ SENSOR_MEASUREMENT = "sensor_measurement"
 CONTROLLER_STEP = "controller_step"
 CONTROLLER_DELIVERY = "controller_delivery"
 SENSOR_ACKNOWLEDGEMENT = "sensor_acknowledgement"
-NETEM_PACKET = "netem_packet"
-NETEM_RELEASE = "netem_release"
 SENSOR_SETTING = "sensor_setting"
 NETEM_SETTING = "netem_setting"
 CONTROLLER_SETTING = "controller_setting"
@@ -41,38 +39,10 @@ SETTINGS = (SENSOR_SETTING, NETEM_SETTING, CONTROLLER_SETTING)
 """Tables of the changes of settings that each process received during the run."""
 CHANGE_BYTES = 1024  # width of a change in the record: JSON, padded with zero bytes
 
-PACKET_HEAD_BYTES = 32
-"""Leading bytes of each datagram that the network emulator records without interpreting them."""
-
 LOOP = "loop"
 """First column of the tables of plant, sensor and controller: the number of the loop."""
 
 NO_SEQUENCE = -1  # stands for "none" in a column of sequence numbers
-
-
-class Fate(IntEnum):
-    """The network emulator's treatment of a datagram."""
-
-    DELIVERED = 0
-    DROPPED = 1
-    FORCED = 2
-    """Delivered by the guarantee, although an impairment would have prevented it."""
-    CORRUPTED = 3
-    """Forwarded with a flipped bit."""
-    OVERFLOWED = 4
-    """Dropped by a queue, full or by the law of CoDel; by a schedule; or by the limit of delayed packets."""
-    BLACKED_OUT = 5
-    """Dropped during a blackout."""
-
-    @property
-    def effective(self) -> bool:
-        """Whether the datagram was effectively delivered, unless it is out of order (stale)."""
-        return self in (Fate.DELIVERED, Fate.FORCED)
-
-
-def effective(fates: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Whether each datagram was effectively delivered, unless it is out of order (stale), (k,)."""
-    return np.asarray((fates == Fate.DELIVERED) | (fates == Fate.FORCED))
 
 
 def entry_names(vector: str, entries: int) -> tuple[str, ...]:

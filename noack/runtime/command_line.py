@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 _LINE = re.compile(r"(?P<source>noack(?: [a-z]+)?): (?P<warning>warning: )?(?P<message>.*)")
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
-DESCRIPTOR_ON_STDIN = "NOACK_DESCRIPTOR_ON_STDIN"
-"""Environment variable of a launched process: its first line of input is its run descriptor."""
 _ECHO_NS = 500_000_000  # a parent may pass on a signal that the process group has received already
 _HANGUP: int | None = getattr(signal, "SIGHUP", None)  # not on Windows
 _ENDING: dict[int, tuple[ExitStatus, str]] = {  # exit status and reason after a signal

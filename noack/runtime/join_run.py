@@ -33,8 +33,11 @@ _DESCRIPTOR_TIMEOUT_S = 24 * 3600.0  # a person may start the recorder late; Ctr
 T = TypeVar("T")
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that all processes have."""
+RUN_OPTIONS = ("--session", "--credentials", "--runs")
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options :data:`RUN_OPTIONS`, which say which run a process joins."""
     origin = parser.add_mutually_exclusive_group()
     origin.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
     origin.add_argument(
@@ -47,6 +50,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="DIRECTORY",
         help="with --credentials: where rows stay that cannot be sent to the recorder",
     )
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that all processes have."""
+    add_run_options(parser)
     parser.add_argument("--json", action="store_true", help="print the final report as JSON")
 
 

@@ -26,6 +26,8 @@ from noack.scenario.toml_file import brief
 from noack.settings.section import ScenarioSection, Seed
 
 DEFAULT_SESSION = "default"
+DESCRIPTOR_ON_STDIN = "NOACK_DESCRIPTOR_ON_STDIN"
+"""Environment variable of a launched process: its first line of input is its run descriptor."""
 
 
 class RunAccess(ScenarioSection):

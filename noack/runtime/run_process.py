@@ -189,7 +189,7 @@ class RunProcess:
         with (
             closing(bind(port, f"ports.{self.role}", self.descriptor.host)) as endpoint,
             # Before the barrier: locking memory may take a tenth of a second.
-            realtime(settings.enabled, settings.fifo_priority, place) as self._realtime,
+            realtime(settings.enabled, settings.fifo_priority, place, len(LOOP_ROLES)) as self._realtime,
         ):
             size_bytes = len(self.resolved.names) * _BUFFER_BYTES  # it may be late to the start
             enlarge_buffer(endpoint, min(size_bytes, _LARGEST_BUFFER_BYTES))

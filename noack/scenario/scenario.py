@@ -21,6 +21,7 @@ from noack.core.random_streams import named_stream_keys
 from noack.scenario.run_sections import MOST_LOOPS, LoopSection, SeedsSection
 from noack.scenario.scenario_checks import check_changes, check_sections
 from noack.scenario.scenario_tables import ScenarioTables
+from noack.scenario.symbols import ScenarioRoot
 from noack.scenario.toml_file import explain
 from noack.settings.section import ReadTable, ScenarioSection, Table
 
@@ -220,5 +221,5 @@ def parts_model(parts: frozenset[str], *, others_optional: bool = False) -> type
             fields[name] = (kind, field)
         elif others_optional:
             fields[name] = (kind | None, None)
-    model: type[ScenarioSection] = create_model("LoopParts", __base__=ScenarioSection, **fields)
+    model: type[ScenarioSection] = create_model("LoopParts", __base__=ScenarioRoot, **fields)
     return model

@@ -29,6 +29,7 @@ from noack.scenario.references import PieceError, scenario_segments
 from noack.scenario.runtime_parameters import LOSS, put_settings, require_runtime_parameters
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.sections import AnyController, AnyTrigger, NetworkSection
+from noack.scenario.symbols import ScenarioRoot
 from noack.scenario.toml_file import explain
 from noack.settings.section import ReadTable, ScenarioSection, Table, require_length, require_shape
 
@@ -43,7 +44,7 @@ class _ChangedNetwork(ScenarioSection):
     constraints: Constraints | None = None
 
 
-class _Change(ScenarioSection):
+class _Change(ScenarioRoot):
     """The tables of a scenario in which a change may set keys; None: it sets none."""
 
     trigger: AnyTrigger | None = None

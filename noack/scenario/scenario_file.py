@@ -26,6 +26,7 @@ from noack.scenario.runtime_parameters import SHORT, full_key
 from noack.scenario.scenario import LOOP_NEEDS, PARTS, Scenario, parts_model, with_loop_tables
 from noack.scenario.scenario_checks import check_reference, check_target_loss
 from noack.scenario.sections import DirectionSection, NetworkSection
+from noack.scenario.symbols import SYMBOLS
 from noack.scenario.toml_file import keys as known_keys
 from noack.scenario.toml_file import nearest_key
 from noack.settings.section import ReadTable, ScenarioSection, Table
@@ -313,7 +314,7 @@ def _attributed(lines: str, path: Path, keys: Sequence[str], given: ReadTable, n
             section, dot, _ = name.partition(".")
             if assignment.startswith(f"{section} = "):
                 nearest_name = nearest_key(name, (*SHORT, *known_keys(Scenario)))
-                if nearest_name and section not in toml_file.SYMBOLS:
+                if nearest_name and section not in SYMBOLS:
                     hint = f"did you mean {nearest_name}?"
                 return f"{named}{name if dot else assignment}: unknown key; {hint}"
         if any(re.match(rf"{re.escape(name)}[.:=\s]", line["rest"]) for name in names):

@@ -36,13 +36,14 @@ from noack.scenario.sections import (
     NetworkSection,
     PlantSection,
 )
+from noack.scenario.symbols import ScenarioRoot
 from noack.settings.section import FolderName, ScenarioSection
 from noack.trigger_policies.decaying import DecayingSettings
 
 MOST_CHANGES = 256  # largest number of scheduled changes in a run
 
 
-class ScenarioTables(ScenarioSection):
+class ScenarioTables(ScenarioRoot):
     """The keys of a scenario; :class:`noack.scenario.scenario.Scenario` checks them together."""
 
     name: FolderName

@@ -33,6 +33,7 @@ from noack.plants.linear import NAMED_MODELS, LinearSettings, NamedModel, parame
 from noack.plants.plant_settings import PlantSettings, name_and_unit, plain_name
 from noack.protocol.record_tables import entry_names
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
+from noack.scenario.symbols import ScenarioRoot
 from noack.settings.section import (
     Bounds,
     Deviations,
@@ -447,7 +448,7 @@ class PlantSection(ScenarioSection):
         return NoiseVariances(variance_at("state", n), variance_at("input", m), self.measurement.variance(n))
 
 
-class DirectionSection(ScenarioSection):
+class DirectionSection(ScenarioRoot):
     """A direction of the network: what happens to its packets, and the guarantee."""
 
     loss: Loss = NoLoss.model_construct()

@@ -266,12 +266,12 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
     if kind == "missing":
         return f"{key}: missing{_purpose(place.section, str(place.path[-1]))}"
     if kind == "extra_forbidden":
-        return f"{assignment}: unknown key; {_nearest(str(place.path[-1]), place.section)}"
+        return f"{assignment}: unknown key; {_nearest(str(place.path[-1]), place.section, root.key_hints)}"
     if kind == "value_error":
         return _own_check(key, value, str(mistake["ctx"]["error"]))
     chosen = kind in ("union_tag_invalid", "union_tag_not_found")
     if chosen and isinstance(value, Mapping):
-        return _choice(key, value, place)
+        return _choice(key, value, place, root.extension_groups)
     if chosen or kind in ("model_type", "model_attributes_type", "dict_type"):
         return f"{assignment}: expected a table{_table_example(value, place)}"
     if kind == "too_short":
@@ -286,10 +286,6 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
     if isinstance(value, str) and _WITH_UNIT.fullmatch(value) and message.endswith("number"):
         message += " alone, without a unit or quotes"
     return f"{assignment}: {message}{_share(value, place)}"
-
-
-_GROUPS = {"system": "noack.plants", "controller": "noack.controllers"}
-"""The tables of which extensions have kinds, and the groups of their entry points."""
 
 
 class _Place(NamedTuple):
@@ -421,13 +417,13 @@ def _own_check(key: str, value: object, message: str) -> str:
     return f"{path} = {show_value(value)}: {problem}"
 
 
-def _choice(key: str, value: object, place: _Place) -> str:
+def _choice(key: str, value: object, place: _Place, groups: Mapping[str, str]) -> str:
     choices_text = ", ".join(place.choices)
     key = f"{key}.{place.discriminator}"
     if not isinstance(value, Mapping) or place.discriminator not in value:
         return f"{key}: missing; one of {choices_text}"
     chosen = value[place.discriminator]
-    if missing := missing_extension(_GROUPS.get(str(place.path[-1]), ""), str(chosen)):
+    if missing := missing_extension(groups.get(str(place.path[-1]), ""), str(chosen)):
         return f"{key} = {show_value(chosen)}: {missing}"
     close = difflib.get_close_matches(str(chosen), place.choices, n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
@@ -470,22 +466,9 @@ def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
     return f" ({purpose})" if purpose else ""
 
 
-SYMBOLS = {
-    "M": "M is network.mansd + 1; set network.mansd",
-    "K": "K is model.gain",
-    "α": "α is trigger.alpha_per_s",
-    "β": "β is trigger.beta",
-    "h": "the sampling period is plant.measure_every / plant.rate_hz",
-    "delay": "a delay is an entry of network.impairments",
-    "x0": "x(0) is plant.initial_state",
-    "seed": "each random part has a seed, e.g. seeds.loss",
-}
-"""What is said of unknown keys that people write, such as the paper's symbols."""
-
-
-def _nearest(key: str, section: type[ScenarioSection] | None) -> str:
-    if key in SYMBOLS:
-        return SYMBOLS[key]
+def _nearest(key: str, section: type[ScenarioSection] | None, hints: Mapping[str, str]) -> str:
+    if key in hints:
+        return hints[key]
     section_keys = sorted(section.model_fields) if section is not None else []
     close = difflib.get_close_matches(key, section_keys, n=1)
     return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(section_keys)}"

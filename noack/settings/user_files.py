@@ -8,7 +8,6 @@ A user's class is in a Python source file or in an installed package. Its code r
 that needs it. Plants, triggers and controllers share this module.
 """
 
-import hashlib
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
@@ -22,62 +21,18 @@ import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
 from noack.core.errors import CallerError, NoackError, one_line
-from noack.core.file_access import read_regular
 from noack.core.linear_systems import Vector
-from noack.settings.section import MatrixRows, Row, ScenarioSection
+from noack.settings.named_file import NamedFile
+from noack.settings.section import ScenarioSection
+from noack.settings.values import MatrixRows, Row
 
 UserCode = Any
 """A class of the user, an object of it, or what its code returns."""
-MOST_BYTES = 64 * 2**20
-"""Largest size of a file that is read completely."""
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 SectionT = TypeVar("SectionT", bound=BaseModel)
 
 FILE_TABLES = ("plant.system", "trigger", "controller")
 """The tables of a scenario that may name such a file."""
-
-
-class NamedFile:
-    """A file, and the setting that names it; relative names are relative to ``folder``.
-
-    Messages begin with ``place``, the table with the key ``file``, e.g. ``run.toml: network.loss``.
-    """
-
-    def __init__(self, name: str, folder: Path, place: str = "") -> None:
-        self.name, self.folder, self.path = name, folder, folder / name
-        self.named = f'{place}.file = "{name}"' if place else name
-
-    def wrong(self, message: str) -> NoReturn:
-        """Refuse the file's content by a CallerError."""
-        raise CallerError(f"{self.named}: {message}")
-
-    def content(self) -> bytes:
-        """Return the file's bytes; raise CallerError if it cannot be read."""
-        try:
-            return read_regular(self.path, MOST_BYTES)
-        except (OSError, ValueError) as error:
-            self._unreadable(error)
-
-    def lines(self) -> Iterator[tuple[int, str]]:
-        """Yield the lines that are neither empty nor comments (#), with their numbers from 1."""
-        text = self.content().decode("utf-8", errors="replace")
-        for number, line in enumerate(text.splitlines(), 1):
-            if line.strip() and not line.startswith("#"):
-                yield number, line.strip()
-
-    def sha256(self) -> str:
-        """Return the SHA-256 of the file in hexadecimal; raise CallerError if it cannot be read."""
-        try:
-            if self.path.exists() and not self.path.is_file():
-                self.wrong("cannot be read: not a regular file")
-            with self.path.open("rb") as file:
-                return hashlib.file_digest(file, "sha256").hexdigest()
-        except (OSError, ValueError) as error:
-            self._unreadable(error)
-
-    def _unreadable(self, error: OSError | ValueError) -> NoReturn:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise CallerError(f"{self.named}: cannot be read: {reason}") from None
 
 
 class FileSettings(ScenarioSection):

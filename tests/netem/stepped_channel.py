@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from netem.channel import Channel, Datagram
+from netem.channel import Channel, Datagram, RunChannel
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import core, ffi
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
@@ -26,7 +26,7 @@ def send(channel: Channel, flow: int, number: int, size_bytes: int, now_ns: int,
 class SteppedChannel:
     """A channel with payloads."""
 
-    def __init__(self, channel: Channel) -> None:
+    def __init__(self, channel: RunChannel) -> None:
         self.channel, self._handled = channel, 0
         self._payloads: dict[int, bytes] = {}
         self._copies: dict[int, int] = {}  # delayed copies of each payload

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from netem.channel import Channel, Datagram, UserNetwork
+from netem.channel import Datagram, RunChannel, UserNetwork
 from netem.link_state import LinkState
 from noack.impairments.link_settings import Counters, LinkSettings
 from noack.protocol.roles import Notice, Record
@@ -30,7 +30,7 @@ class Link:
         network: UserNetwork | None = None,
     ) -> None:
         self.state = LinkState(settings, seed, *name, rows=flows, any_order=network is not None)
-        self._channel = SteppedChannel(Channel([self.state], loops=flows, network=network))
+        self._channel = SteppedChannel(RunChannel([self.state], loops=flows, network=network))
         self._started = flows
 
     @property

@@ -48,7 +48,7 @@ def test_each_packet_leaves_as_its_row_says(
 ) -> None:
     """What waits for the link's next decision may leave later than its row says."""
     links = [LinkState(first, 5, "update", rows=LOOPS), LinkState(second, 5, "actuation", rows=LOOPS)]
-    channel = SteppedChannel(Channel(links, loops=LOOPS))
+    channel = SteppedChannel(RunChannel(links, loops=LOOPS))
     now_ns, rng = 0, np.random.default_rng(1)
     sent: dict[tuple[int, int], bytes] = {}
     planned, left, inputs = Counter[tuple[int, ...]](), Counter[tuple[int, ...]](), list[int]()

@@ -16,7 +16,7 @@ from cosim.analysis.replay.replay_result import ProcessReplay, difference, first
 from cosim.analysis.summary.summary_model import ReplayDifference
 from cosim.record.rows import Rows, Slice
 from cosim.record.run_record import RunRecord
-from netem.channel import Channel, channel_of
+from noack.machines.run_channel import RunChannel, channel_of
 from noack.core.cached_method import cached_method
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi, pointer_to
@@ -65,11 +65,11 @@ class InputReplay:
     """
 
     def __init__(
-        self, role: str, machine: LoopMachines | Channel, sizes: Mapping[Flow, int], loop: int = 0
+        self, role: str, machine: LoopMachines | RunChannel, sizes: Mapping[Flow, int], loop: int = 0
     ) -> None:
         self.difference: ReplayDifference | None = None
         self._machine, self._sizes = machine, sizes
-        self._is_network = isinstance(machine, Channel)
+        self._is_network = isinstance(machine, RunChannel)
         width = _DATAGRAM_WORDS if self._is_network else _HEADER_WORDS + max(sizes.values()) + 1
         self._core: CData = ffi.new(
             "noack_input_replay *",
@@ -108,7 +108,7 @@ class InputReplay:
         if (wrong := core.noack_replay_check(replay)) != ffi.NULL:
             raise ValueError(f"replay: {ffi.string(wrong).decode()}")
         locate = _InputRows(tables, order, before)
-        if not isinstance(self._machine, Channel):
+        if not isinstance(self._machine, RunChannel):
             self._machine.before_answer = lambda part: self._recall(part, locate)
         try:
             while (reason := core.noack_replay_inputs(replay)) != core.NOACK_DONE:
@@ -116,7 +116,7 @@ class InputReplay:
                     raise ValueError("no run has these numbers")
                 if reason == core.NOACK_REPLAY_SETTING:
                     self._announce(locate)
-                elif isinstance(self._machine, Channel):
+                elif isinstance(self._machine, RunChannel):
                     self._machine.answer(reason)
                 else:
                     self._machine.raise_failure()

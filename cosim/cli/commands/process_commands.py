@@ -145,7 +145,7 @@ def controller(
 def netem(context: typer.Context) -> int:
     """Join the open run as the network; or relay any UDP program: `noack netem --help`."""
     opt.require_linux()
-    from netem.__main__ import main
+    from noack.network_process.__main__ import main
 
     # typer removes the first `--`, which begins the command of a shell.
     return main(sys.argv[2:] if "--" in sys.argv else context.args)

@@ -34,7 +34,7 @@ from noack.runtime.run_descriptor import RunDescriptor
 
 MODULES = {
     "recorder": "cosim.live.recording.recorder",
-    "netem": "netem.__main__",
+    "netem": "noack.network_process.__main__",
     "plant": "plant_server.__main__",
     "sensor": "sensor_node.__main__",
     "controller": "controller_node.__main__",

@@ -10,7 +10,7 @@ _MODULES = (
     "plant_server.__main__",
     "sensor_node.__main__",
     "controller_node.__main__",
-    "netem.__main__",
+    "noack.network_process.__main__",
     "cosim.live.recording.recorder",
     "noack.scenario.scenario_file",
     "numpy.random",

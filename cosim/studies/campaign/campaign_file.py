@@ -17,6 +17,7 @@ from cosim.simulation.exact_simulation import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.core.errors import CallerError
 from noack.scenario import toml_file
+from noack.scenario.symbols import ScenarioRoot
 from noack.settings.section import FolderName, MatrixRows, ScenarioSection, Seed
 
 MOST_POINTS = 10_000
@@ -249,7 +250,7 @@ _CHUNK_DRAWS, _SAMPLED_DRAWS = 2000, 20
 """Draws per file: each file takes some seconds."""
 
 
-class Campaign(ScenarioSection):
+class Campaign(ScenarioRoot):
     """Many runs over a grid of settings."""
 
     name: FolderName

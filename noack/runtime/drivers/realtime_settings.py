@@ -25,16 +25,11 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple, TypeVarTuple
 
-from noack.protocol.roles import LOOP_ROLES
-
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _MADV_POPULATE_READ, _MADV_POPULATE_WRITE = 22, 23
 """Constants of Linux and glibc, from <linux/prctl.h>, <sys/mman.h> and <malloc.h>."""
-_LAST_PLACE = len(LOOP_ROLES) - 1
-"""Place of the last process of the loop, which alone has the scenario's priority. Each earlier one
-has a priority lower by 1."""
 _CPU_DMA_LATENCY = Path("/dev/cpu_dma_latency")
 _LARGE_BYTES = 16 * 2**20
 _KEPT_BYTES = 32 * 2**20
@@ -46,13 +41,15 @@ Arguments = TypeVarTuple("Arguments")
 
 
 @contextmanager
-def realtime(enabled: bool, fifo_priority: int, place: int | None = None) -> Iterator[dict[str, str]]:
+def realtime(
+    enabled: bool, fifo_priority: int, place: int | None = None, places: int = 1
+) -> Iterator[dict[str, str]]:
     """Apply the real-time settings to the calling thread, and undo them with the context.
 
-    ``place`` counts the processes along the loop from 0, the plant. The plant has the first core,
-    the others share the second: a message between them then needs no wake-up of another core. Each
-    has a higher priority than the one before it, so that a receiver runs at once; the last has
-    ``fifo_priority``. None leaves the core to the system.
+    ``place`` counts the processes along a loop of ``places`` processes from 0. The first process has
+    the first core, the others share the second: a message between them then needs no wake-up of
+    another core. Each has a higher priority than the one before it, so that a receiver runs at once;
+    the last has ``fifo_priority``. None leaves the core to the system.
 
     Yields:
         For each setting ``"applied"``, ``"not permitted: why"`` or ``"not requested"``.
@@ -68,7 +65,7 @@ def realtime(enabled: bool, fifo_priority: int, place: int | None = None) -> Ite
             # Locking memory takes 0.1 s: at real-time priority it would block this core.
             applied["memory_lock"] = _attempt(lock_memory)
             applied["timer_slack"] = _attempt(_call_system, "prctl", _PR_SET_TIMERSLACK, 1, 0, 0, 0)
-            applied["sched_fifo"] = _attempt(_set_fifo_priority, fifo_priority, place, undo)
+            applied["sched_fifo"] = _attempt(_set_fifo_priority, fifo_priority, place, places, undo)
             if place is not None and applied["sched_fifo"] == "applied":
                 applied["affinity"] = _attempt(_set_affinity, place, undo)
             applied["cpu_dma_latency"] = _attempt(_set_cpu_dma_latency, undo)
@@ -84,16 +81,16 @@ def _attempt(apply: Callable[[*Arguments], None], *arguments: *Arguments) -> str
     return "applied"
 
 
-def _set_fifo_priority(priority: int, place: int | None, undo: ExitStack) -> None:
+def _set_fifo_priority(priority: int, place: int | None, places: int, undo: ExitStack) -> None:
     if sys.platform != "linux":
         raise OSError(0, "not available on this system")
     loop = threading.get_native_id()
-    rank = priority if place is None else priority - _LAST_PLACE + place
+    rank = priority if place is None else priority - places + 1 + place
     os.sched_setscheduler(loop, os.SCHED_FIFO, os.sched_param(max(rank, 1)))
     undo.callback(os.sched_setscheduler, 0, os.SCHED_OTHER, os.sched_param(0))
-    # The other threads (zenoh's) share locks with the loop; left at normal priority, one that is
+    # The other threads (such as zenoh's) share locks with the loop; left at normal priority, one that is
     # preempted while it holds a lock would keep the loop waiting for milliseconds.
-    rank = priority - _LAST_PLACE - 1
+    rank = priority - places
     for thread in {int(task.name) for task in Path("/proc/self/task").iterdir()} - {loop}:
         with suppress(ProcessLookupError):
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(max(rank, 1)))

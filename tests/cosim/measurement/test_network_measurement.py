@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import noack
+from cosim.measurement.certificate_time import measured_certificate_time
 from cosim.measurement.measurement_outputs import measurement_figures, measurement_tables
 from cosim.measurement.network_measurement import (
     MeasurementOptions,
@@ -52,7 +53,7 @@ def test_any_trace_is_measured(records: list[tuple[int, int | None]], deadline_s
     with np.errstate(all="raise", under="ignore"):
         document = measurement.to_json()
     assert document["effective_losses"] >= int(lost.sum())
-    void = measurement.certificate_time(noack.load("lane_following"))
+    void = measured_certificate_time(measurement, noack.load("lane_following"))
     assert 0 <= void.share <= 1
     assert all(cause.share <= void.share for cause in void.causes)
     assert [*measurement_tables(measurement, void)]

@@ -314,7 +314,7 @@ ON_THE_RIGHT = (3, 0), (0, 200), (1, 1), (1, 100), (2, 50)
 def core_departures(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
     """Return the same of the core: the departures in ns, and the consecutive losses."""
     link = LinkState(settings, 0, "a", rows=4)
-    channel = Channel([link], loops=4)
+    channel = Channel([link], flows=4)
     numbers: dict[tuple[int, int], int] = {}
     leaves_ns, losses = [-1] * len(arrivals), []
     for number, (now_ns, flow, size, level) in enumerate([*arrivals, (2**60, 0, 0, 0)]):
@@ -379,7 +379,7 @@ def test_a_scheduler_sends_the_first_of_what_waits_when_the_link_is_free(
 
 def test_a_change_makes_the_order_of_what_waits_final() -> None:
     link = LinkState(settings_of("rate 8mbit 0 queue 9 priority 3,2,1"), 0, "a", rows=3)
-    channel, departures = Channel([link], loops=3), []
+    channel, departures = Channel([link], flows=3), []
     for flow in (0, 0, 1):
         channel.send(flow, 0, 1000, 0)
     channel.change(settings_of("rate 4mbit 0 queue 9 priority 3,2,1 delay 10ms"))
