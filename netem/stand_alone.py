@@ -12,8 +12,8 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import Protocol
 
-from netem.control.control_server import starting
 from netem.control.emulator_statistics import Statistics, statistics, unintended_losses
+from netem.control.running_emulators import starting
 from netem.control.statistics_text import statistics_lines
 from netem.emulator_options import command_line_parser, explained_packets, parse_options, specs_of
 from netem.explanation import explain

@@ -21,7 +21,7 @@ from benchmarks.report import ZERO, Goal, MeasurementError, Row, benchmark
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import load_record
 from noack.core.file_access import create_folder, write_whole
-from noack.protocol.record_tables import NETEM_RELEASE
+from noack.core.packet_rows import NETEM_RELEASE
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.spool import SPOOL
 from noack.scenario.scenario_file import load

@@ -11,7 +11,8 @@ from cosim.measurement.loss_bursts import WINDOWS
 from cosim.measurement.measurement_outputs import measurement_document
 from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
 from cosim.measurement.network_section import write_network
-from cosim.measurement.trace_sources import USUAL_PERIOD_NS, SourceOptions, probe_period_ns, read_source
+from cosim.measurement.run_trace import read_source
+from cosim.measurement.trace_sources import USUAL_PERIOD_NS, SourceOptions, probe_period_ns
 from noack.core.file_access import require_suffix
 from noack.core.number_checks import one_of
 from noack.impairments.burst_prediction import USUAL_PACKETS

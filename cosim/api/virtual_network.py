@@ -10,11 +10,12 @@ from typing import Generic, NamedTuple, TypeVar
 
 from cosim.api.scenarios import Source, load
 from cosim.shipped_files import find_shipped
-from netem.channel import Channel, Departure, link_name, require_stand_alone
+from netem.channel import Channel, Departure
 from netem.link_state import LinkState
 from noack.core.errors import CallerError
 from noack.core.number_checks import one_of, whole_number
-from noack.protocol.record_tables import NETEM_PACKET
+from noack.core.packet_rows import NETEM_PACKET
+from noack.machines.run_channel import link_name, require_stand_alone
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario

@@ -130,7 +130,7 @@ def _setting_hint(option: str, command: "Command | None") -> str:
     """Return what to set instead if the name of an unknown option is that of a scenario's key."""
     from noack.scenario.runtime_parameters import SHORT
     from noack.scenario.scenario import Scenario
-    from noack.scenario.toml_file import SYMBOLS
+    from noack.scenario.symbols import SYMBOLS
     from noack.scenario.toml_file import keys as keys_of
 
     if command is None or not any("--set" in parameter.opts for parameter in command.params):

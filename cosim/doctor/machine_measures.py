@@ -27,8 +27,8 @@ from noack.core.errors import CallerError, MachineError, NoackError, one_line, w
 from noack.core.system_processes import python_command
 from noack.runtime.active_runs import RUNS
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
+from noack.runtime.counting_sockets import bind
 from noack.runtime.private_folder import open_private
-from noack.runtime.udp_sockets import bind
 from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario import Scenario
 

@@ -22,7 +22,7 @@ from noack.core.file_access import open_regular
 from noack.core.number_checks import real_number, whole_number
 from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
 from noack.impairments.link_settings import LinkSettings
-from noack.settings.user_files import NamedFile
+from noack.settings.named_file import NamedFile
 from noack.traces.capture_packets import is_capture
 from noack.traces.capture_trace import CaptureFileError, CaptureOptions, read_captures
 from noack.traces.numbered_datagrams import SequenceField

@@ -27,8 +27,8 @@ from cosim.simulation.continuous import ContinuousSummary
 from noack.core.errors import ExitStatus
 from noack.core.number_format import counted, duration_at_least, number
 from noack.protocol.wire_format import Rejection
+from noack.runtime.counting_sockets import DROPPED_IN_FLOOD
 from noack.runtime.end_reasons import HORIZON
-from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
 
 _MOST_NAMED = 3
 """Largest number of claims of a verdict that are named."""

@@ -43,9 +43,9 @@ from cosim.record.run_directory import (
 from cosim.record.table_files import TableFile
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
+from noack.core.packet_rows import NETEM_RELEASE
 from noack.protocol.record_tables import (
     LOOP,
-    NETEM_RELEASE,
     NO_SEQUENCE,
     OWNER,
     PLANT_STEP,

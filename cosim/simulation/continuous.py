@@ -36,12 +36,12 @@ from cosim.simulation.exact_simulation import (
     vanished_error,
     vanishes_s,
 )
-from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState
 from noack.core.core_library import core
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.linear_systems import Matrix, Vector
-from noack.protocol.record_tables import Fate
+from noack.core.packet_rows import Fate
+from noack.machines.run_channel import UPDATE_LINK
 from noack.scenario.resolution import LoopMatrices, loop_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.theory.coverage import require_exact

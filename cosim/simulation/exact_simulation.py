@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState, stream_names
 from noack.core.core_library import CData, core, dtype_of, ffi, new_handle, new_structure, pointer_to
 from noack.core.errors import CallerError
@@ -23,6 +22,7 @@ from noack.core.random_streams import stream_keys
 from noack.impairments.kinds.corrupt import Corrupt
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
+from noack.machines.run_channel import UPDATE_LINK
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.theory.coverage import require_exact

@@ -26,7 +26,6 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from cosim.record.run_scenario import write_scenario
-from netem.channel import RUN_ID, UserNetwork, channel_of
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.core_library import CData, core, ffi, new_handle
 from noack.core.errors import ExitStatus, MachineError, why
@@ -34,6 +33,7 @@ from noack.core.file_access import remove_folder
 from noack.core.progress import Progress, no_progress
 from noack.core.system_processes import require_limits
 from noack.machines.loop_machines import LoopMachines, row_types
+from noack.machines.run_channel import RUN_ID, UserNetwork, channel_of
 from noack.protocol.record_tables import LOOP, OWNER, is_of_network, network_tables
 from noack.protocol.roles import CHANGEABLE, LOOP_ROLES, RECORDER, Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Flow, Rejection

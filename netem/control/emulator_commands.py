@@ -15,8 +15,8 @@ from typing import Any, Self, cast
 import zenoh
 from zenoh.handlers import RingChannel
 
-from netem.control.control_server import EMULATORS, find_emulator, running_emulators
 from netem.control.emulator_statistics import Statistics
+from netem.control.running_emulators import EMULATORS, find_emulator, running_emulators
 from netem.control.statistics_text import statistics_lines
 from netem.relay.relay_reports import DIRECTIONS
 from netem.tc_words import guarantee_words, require_no_dashes, settings_of

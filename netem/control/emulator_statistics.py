@@ -28,8 +28,8 @@ from netem.relay.relay_reports import (
 )
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
+from noack.core.packet_rows import Fate
 from noack.impairments.link_settings import Counters
-from noack.protocol.record_tables import Fate
 from noack.runtime.address import address_text
 
 _Z = 1.959963984540054

@@ -9,7 +9,8 @@ from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.references import AnyPiece
-from noack.settings.section import RateHz, Row, ScenarioSection
+from noack.settings.section import ScenarioSection
+from noack.settings.values import RateHz, Row
 
 MOST_PIECES = 10_000
 

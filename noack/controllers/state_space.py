@@ -10,7 +10,7 @@ from pydantic import model_validator
 
 from noack.controllers.controller_settings import ControllerSettings, ControlModel
 from noack.controllers.linear_feedback import LinearFeedback
-from noack.settings.section import MatrixRows, require_shape
+from noack.settings.values import MatrixRows, require_shape
 
 
 class StateSpaceSettings(ControllerSettings):

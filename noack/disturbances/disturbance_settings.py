@@ -12,7 +12,8 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.periods import Period
-from noack.settings.section import Row, ScenarioSection, Table
+from noack.settings.section import ScenarioSection, Table
+from noack.settings.values import Row
 
 Place = Literal["input", "state"]
 

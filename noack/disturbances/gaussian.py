@@ -7,7 +7,7 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import normals
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.section import Deviations
+from noack.settings.values import Deviations
 
 
 class GaussianDisturbance(DisturbanceSettings):

@@ -7,7 +7,8 @@ from pydantic import FiniteFloat
 
 from noack.core.linear_systems import Matrix
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.section import Positive, Row
+from noack.settings.section import Positive
+from noack.settings.values import Row
 
 
 class SineDisturbance(DisturbanceSettings):

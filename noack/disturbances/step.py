@@ -8,7 +8,8 @@ from pydantic import Field, FiniteFloat, model_validator
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.section import NonNegative, Row
+from noack.settings.section import NonNegative
+from noack.settings.values import Row
 
 
 class StepDisturbance(DisturbanceSettings):

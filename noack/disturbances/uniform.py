@@ -7,7 +7,7 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import uniforms
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.section import Bounds
+from noack.settings.values import Bounds
 
 
 class UniformDisturbance(DisturbanceSettings):

@@ -22,8 +22,8 @@ from noack.guarantee.loss_guarantee import LossRule
 from noack.impairments.clauses import Clause, Part
 from noack.impairments.markov_chain import Chain, PeriodicLosses, chance_chain
 from noack.impairments.words import CORRELATION, PERCENT, brief_percent
+from noack.settings.named_file import NamedFile
 from noack.settings.section import Correlation, Probability, ScenarioSection
-from noack.settings.user_files import NamedFile
 
 T = TypeVar("T")
 MOST_FLOWS = 65_535

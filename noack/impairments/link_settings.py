@@ -134,7 +134,7 @@ class Counters:
     received: int = 0
     received_bytes: int = 0
     delivered: int = 0
-    """Fates; see :class:`noack.protocol.record_tables.Fate`."""
+    """Fates; see :class:`noack.core.packet_rows.Fate`."""
     dropped: int = 0
     forced: int = 0
     corrupted: int = 0

@@ -8,7 +8,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.random_streams import uniform_pair
 from noack.impairments.feature import StageTables
 from noack.impairments.words import OWN_TIME_S, Quantity, time_text
-from noack.settings.user_files import NamedFile
+from noack.settings.named_file import NamedFile
 
 Offset = Annotated[FiniteFloat, Field(ge=0, le=1e9)] | Literal["random"]
 """In seconds after the trace's first packet."""

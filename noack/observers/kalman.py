@@ -30,7 +30,7 @@ from noack.core.core_library import core, pointer_to, reals_at
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
-from noack.settings.section import Deviations, MatrixRows, require_length, require_shape, rows_of
+from noack.settings.values import Deviations, MatrixRows, require_length, require_shape, rows_of
 
 _MOST_GAINS = 1000
 """Gains that are not constant after so many measurements are not stated."""

@@ -15,7 +15,7 @@ from noack.core.core_library import core
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings, observer_gain
-from noack.settings.section import MatrixRows, require_shape
+from noack.settings.values import MatrixRows, require_shape
 
 Pole = FiniteFloat | tuple[FiniteFloat, ...]
 

@@ -14,7 +14,8 @@ import numpy as np
 from noack.core.core_library import CData, new_handle, new_structure
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.pole_placement import place_poles
-from noack.settings.section import Row, ScenarioSection, Table, require_length
+from noack.settings.section import ScenarioSection, Table
+from noack.settings.values import Row, require_length
 
 _RANK_TOLERANCE = 1e-9
 """Least singular value of a scaled matrix of full rank; eigenvalues this close to 1 do not decay."""

@@ -26,8 +26,8 @@ from noack.plants.plant_settings import (
     SystemFailedError,
     name_and_unit,
 )
-from noack.settings.section import require_distinct, require_name
 from noack.settings.user_files import ClassSettings, UserCode, new_instance, read_only, real_vector, user_code
+from noack.settings.values import require_distinct, require_name
 
 _PLACE = "plant.system"
 _START_TOLERANCE = 1e-6

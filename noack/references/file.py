@@ -13,8 +13,9 @@ from noack.core.errors import shortened
 from noack.core.linear_systems import Matrix, transition
 from noack.core.references import ReferenceSegment
 from noack.references.piece_settings import PieceSettings, TimeS
-from noack.settings.section import Positive, Row, rows_of
-from noack.settings.user_files import NamedFile
+from noack.settings.named_file import NamedFile
+from noack.settings.section import Positive
+from noack.settings.values import Row, rows_of
 
 MOST_ROWS = 100_000
 TIME = "t_s"

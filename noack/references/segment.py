@@ -7,7 +7,7 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.references import ReferenceSegment
 from noack.references.piece_settings import PieceSettings, TimeS
-from noack.settings.section import MatrixRows, Row, rows_of
+from noack.settings.values import MatrixRows, Row, rows_of
 
 
 class SolutionSegment(PieceSettings):

@@ -20,11 +20,17 @@ from setproctitle import setproctitle
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
 from noack.core.system_processes import exhausted_limit, require_limits
 from noack.runtime.address import address_text
-from noack.runtime.command_line import DESCRIPTOR_ON_STDIN, Parser, Signals, report_failure
+from noack.runtime.command_line import Parser, Signals, report_failure
 from noack.runtime.connections.credentials import read_credentials
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.end_reasons import HORIZON
-from noack.runtime.run_descriptor import DEFAULT_SESSION, RunDescriptor, find_descriptor, parse_descriptor
+from noack.runtime.run_descriptor import (
+    DEFAULT_SESSION,
+    DESCRIPTOR_ON_STDIN,
+    RunDescriptor,
+    find_descriptor,
+    parse_descriptor,
+)
 from noack.runtime.run_process import RunProcess, launcher_has_ended
 
 _RUNS = Path("runs")

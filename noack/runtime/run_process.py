@@ -51,6 +51,7 @@ from noack.runtime.control_messages import (
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates
+from noack.runtime.counting_sockets import CountingSockets, bind
 from noack.runtime.drivers.live_driver import LiveDriver, LoopSockets
 from noack.runtime.drivers.real_time_loop import Driver, ProcessSockets, run_loop
 from noack.runtime.drivers.realtime_settings import realtime
@@ -60,7 +61,7 @@ from noack.runtime.kept_rows import KeptFile, KeptHead
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.runtime.spool import SPOOL
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
-from noack.runtime.udp_sockets import CountingSockets, bind, enlarge_buffer
+from noack.runtime.udp_sockets import enlarge_buffer
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario_checks import prepare_changes

@@ -29,7 +29,7 @@ from noack.observers.luenberger import LuenbergerSettings
 from noack.scenario.loads import COMPARING_ERRORS, padded, with_weight
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.sections import AnyObserver, ModelSection, PlantSection, instability
-from noack.settings.section import MatrixRows, require_distinct, require_shape, rows_of
+from noack.settings.values import MatrixRows, require_distinct, require_shape, rows_of
 from noack.trigger_policies.policy_settings import CombinedSettings
 
 S = TypeVar("S", bound=ScenarioTables)

@@ -28,7 +28,7 @@ from noack.observers.luenberger import LuenbergerSettings
 from noack.observers.observer_settings import NoiseVariances, observer_gain, unobservable_mode
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.sections import AnyObserver, ModelSection, PlantSection
-from noack.settings.section import require_distinct, require_length, rows_of
+from noack.settings.values import require_distinct, require_length, rows_of
 from noack.trigger_policies.policy_settings import CombinedSettings, PolicySettings, WeightedSettings
 
 S = TypeVar("S", bound=ScenarioTables)

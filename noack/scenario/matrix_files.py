@@ -25,8 +25,9 @@ from noack.protocol.wire_format import MAX_DIMENSION
 from noack.scenario.mat_file import arrays_of_mat
 from noack.scenario.sections import ModelSection, instability
 from noack.scenario.toml_file import brief
-from noack.settings.section import ReadTable, require_shape, rows_of
-from noack.settings.user_files import NamedFile
+from noack.settings.named_file import NamedFile
+from noack.settings.section import ReadTable
+from noack.settings.values import require_shape, rows_of
 
 Arrays = dict[str, NDArray[np.generic]]
 NPZ, MAT = ".npz", ".mat"

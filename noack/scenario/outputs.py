@@ -7,7 +7,8 @@ its deviation is c (x - x_r).
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from noack.settings.section import Name, Positive, Row, ScenarioSection, Unit, require_length
+from noack.settings.section import Positive, ScenarioSection
+from noack.settings.values import Name, Row, Unit, require_length
 
 DISTANCE = "output "
 """What the name of an output's distance begins with."""

@@ -53,7 +53,8 @@ from noack.scenario.scenario import (
 )
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.sections import AnyObserver, ModelSection, PlantSection
-from noack.settings.section import ScenarioSection, rows_of
+from noack.settings.section import ScenarioSection
+from noack.settings.values import rows_of
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
 from noack.trigger_policies.trigger_rule import Policy, TriggerRule, require_rule
 

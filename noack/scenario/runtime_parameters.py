@@ -11,7 +11,8 @@ from types import NoneType
 from typing import get_args
 
 from noack.core.errors import CallerError
-from noack.scenario.toml_file import SYMBOLS, nearest_key
+from noack.scenario.symbols import SYMBOLS
+from noack.scenario.toml_file import nearest_key
 from noack.settings.section import ReadTable, Table
 from noack.trigger_policies.policy_settings import PolicySettings
 

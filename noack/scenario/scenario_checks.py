@@ -31,7 +31,8 @@ from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.sections import AnyController, AnyTrigger, NetworkSection
 from noack.scenario.symbols import ScenarioRoot
 from noack.scenario.toml_file import explain
-from noack.settings.section import ReadTable, ScenarioSection, Table, require_length, require_shape
+from noack.settings.section import ReadTable, ScenarioSection, Table
+from noack.settings.values import require_length, require_shape
 
 S = TypeVar("S", bound=ScenarioTables)
 

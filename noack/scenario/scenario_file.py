@@ -29,8 +29,9 @@ from noack.scenario.sections import DirectionSection, NetworkSection
 from noack.scenario.symbols import SYMBOLS
 from noack.scenario.toml_file import keys as known_keys
 from noack.scenario.toml_file import nearest_key
+from noack.settings.named_file import NamedFile
 from noack.settings.section import ReadTable, ScenarioSection, Table
-from noack.settings.user_files import NamedFile, file_tables, with_absolute_path, with_tables
+from noack.settings.user_files import file_tables, with_absolute_path, with_tables
 from noack_check.files import MOST_LEVELS
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""

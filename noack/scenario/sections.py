@@ -34,24 +34,21 @@ from noack.plants.plant_settings import PlantSettings, name_and_unit, plain_name
 from noack.protocol.record_tables import entry_names
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
 from noack.scenario.symbols import ScenarioRoot
-from noack.settings.section import (
+from noack.settings.section import NonNegative, ScenarioSection, kinds_in, union_of
+from noack.settings.values import (
     Bounds,
     Deviations,
     HalfWidthRows,
     HalfWidths,
     MatrixRows,
     Name,
-    NonNegative,
     RateHz,
     Row,
-    ScenarioSection,
     Unit,
-    kinds_in,
     require_distinct,
     require_length,
     require_shape,
     shape,
-    union_of,
 )
 from noack.trigger_policies.policy_settings import ModelMatrices, PolicySettings
 

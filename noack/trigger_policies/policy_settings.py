@@ -17,7 +17,8 @@ from pydantic import Field, FiniteFloat, field_validator
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.core.periods import Period, exact_ns
-from noack.settings.section import MatrixRows, ReadTable, ScenarioSection, require_shape, rows_of
+from noack.settings.section import ReadTable, ScenarioSection
+from noack.settings.values import MatrixRows, require_shape, rows_of
 from noack.trigger_policies.trigger_rule import Policy, TriggerRule, require_rule
 
 Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]

@@ -18,7 +18,7 @@ from noack.proof.statement_proof import prove_statement
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import resolve
-from noack.settings.section import rows_of
+from noack.settings.values import rows_of
 from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError

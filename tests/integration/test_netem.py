@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from netem.control import emulator_commands
-from netem.control.control_server import running_emulators
+from netem.control.running_emulators import running_emulators
 from netem.relay.relay import Relay
 from noack.core.errors import ExitStatus
 from tests.helpers.emulators import Emulate

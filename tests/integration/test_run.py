@@ -24,10 +24,10 @@ from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord, load_record
 from cosim.simulation.virtual_time import simulate
 from noack.core.clock import NS_PER_S
+from noack.core.packet_rows import NETEM_PACKET
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
-    NETEM_PACKET,
     PLANT_ACTUATION,
     PLANT_STEP,
     SENSOR_MEASUREMENT,

@@ -12,9 +12,9 @@ import pytest
 from native.build import HEADER, is_current
 from noack.core.core_library import LIBRARY, address_of, core, dtype_of, ffi, load_core, pointer_to
 from noack.core.errors import CallerError
+from noack.core.packet_rows import Fate
 from noack.impairments.feature import StageTables
 from noack.impairments.link_settings import Counters
-from noack.protocol.record_tables import Fate
 from tests.noack.impairments.feature_examples import IMPAIRED, names_file
 
 ROOT = Path(__file__).parents[2]

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Sequence
 
-from netem.channel import Channel, Datagram, RunChannel
+from netem.channel import Channel
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import core, ffi
-from noack.protocol.record_tables import PACKET_HEAD_BYTES
+from noack.core.packet_rows import PACKET_HEAD_BYTES
+from noack.machines.run_channel import Datagram, RunChannel
 from noack.protocol.roles import Notice, Record
 from noack.scenario.parameter_changes import ParameterChange
 

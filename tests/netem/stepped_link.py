@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
-from netem.channel import Datagram, RunChannel, UserNetwork
 from netem.link_state import LinkState
 from noack.impairments.link_settings import Counters, LinkSettings
+from noack.machines.run_channel import Datagram, RunChannel, UserNetwork
 from noack.protocol.roles import Notice, Record
 from tests.netem.stepped_channel import SteppedChannel
 

@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.channel import Datagram, channel_of
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import core
+from noack.core.packet_rows import NETEM_PACKET, Fate
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.record_tables import NETEM_PACKET, Fate, tables
+from noack.machines.run_channel import Datagram, channel_of
+from noack.protocol.record_tables import tables
 from noack.protocol.roles import Notice, Record
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate

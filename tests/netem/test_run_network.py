@@ -15,17 +15,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.shipped_files import find_shipped
-from netem.channel import Datagram, channel_of
-from netem.run_network import NetworkSockets, RunNetwork
 from noack.core.clock import RunClock
+from noack.core.packet_rows import NETEM_PACKET, NETEM_RELEASE
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER
+from noack.machines.run_channel import Datagram, channel_of
+from noack.network_process.run_network import NetworkSockets, RunNetwork
+from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.runtime.address import address_text
+from noack.runtime.counting_sockets import bind
 from noack.runtime.drivers.real_time_loop import run_loop
 from noack.runtime.telemetry import TelemetryBuffer
-from noack.runtime.udp_sockets import bind
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load

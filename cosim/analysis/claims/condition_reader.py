@@ -12,7 +12,8 @@ from cosim.analysis.conformance.input_origins import AppliedUpdate, SampledSerie
 from cosim.record.rows import messages_in
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
-from noack.protocol.record_tables import NETEM_PACKET, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT, effective
+from noack.core.packet_rows import NETEM_PACKET, effective
+from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.runtime.host_clocks import RECEIVED, allowed_lead_ns
 
 _PACKET_COLUMNS = ("fate", "head")

@@ -29,9 +29,9 @@ from cosim.analysis.replay.replay_result import (
 )
 from cosim.record.rows import Rows, Slice
 from cosim.record.run_record import RecordedRun, RunRecord
+from noack.core.packet_rows import NETEM_PACKET
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
-    NETEM_PACKET,
     PLANT_ACTUATION,
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,

@@ -24,6 +24,7 @@ from cosim.analysis.summary.summary_model import (
 from cosim.record.run_events import ActuationTimes, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NEVER_NS, NS_PER_S
+from noack.core.packet_rows import Fate, effective
 from noack.guarantee.loss_guarantee import LongestBurst
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -33,8 +34,6 @@ from noack.protocol.record_tables import (
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
     STEP_TABLES,
-    Fate,
-    effective,
 )
 from noack.protocol.roles import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import Flow, Rejection

@@ -26,15 +26,9 @@ from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
+from noack.core.packet_rows import NETEM_PACKET, Fate, effective
 from noack.impairments.target_loss import expected_loss
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    NETEM_PACKET,
-    PLANT_STEP,
-    UPDATES,
-    Fate,
-    effective,
-)
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_STEP, UPDATES
 from noack.protocol.roles import FAILED, LOOP_ROLES
 from noack.protocol.wire_format import Flow
 from noack.scenario.runtime_parameters import text_of

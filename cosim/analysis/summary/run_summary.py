@@ -24,10 +24,10 @@ from cosim.record.run_record import Rows, RunRecord, no_such_loop
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
 from noack.core.number_format import number as number_text
+from noack.core.packet_rows import NETEM_PACKET, Fate
 from noack.impairments.feature import Impairment
 from noack.impairments.kinds.duplicate import Duplicate
 from noack.impairments.kinds.rate import Rate
-from noack.protocol.record_tables import NETEM_PACKET, Fate
 
 _BINS = 200
 """Intervals of the datagrams in flight."""

@@ -156,7 +156,8 @@ def measure(
     from cosim.measurement.loss_bursts import WINDOWS
     from cosim.measurement.measurement_outputs import OutputRequest, write_outputs
     from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
-    from cosim.measurement.trace_sources import SourceOptions, read_source
+    from cosim.measurement.run_trace import read_source
+    from cosim.measurement.trace_sources import SourceOptions
     from noack.traces.packet_trace import find_trace
 
     options = MeasurementOptions(

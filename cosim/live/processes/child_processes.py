@@ -29,8 +29,7 @@ from noack.core.errors import ExitStatus, MachineError, why
 from noack.core.file_access import open_append
 from noack.core.system_processes import require_limits
 from noack.protocol.roles import RECORDER
-from noack.runtime.command_line import DESCRIPTOR_ON_STDIN
-from noack.runtime.run_descriptor import RunDescriptor
+from noack.runtime.run_descriptor import DESCRIPTOR_ON_STDIN, RunDescriptor
 
 MODULES = {
     "recorder": "cosim.live.recording.recorder",

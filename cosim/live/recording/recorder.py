@@ -27,14 +27,13 @@ from noack.core.core_library import core
 from noack.core.errors import ExitStatus, MachineError, PeerError
 from noack.core.file_access import remove_file
 from noack.core.number_format import counted
+from noack.core.packet_rows import NETEM_PACKET, effective
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     LOOP,
-    NETEM_PACKET,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
-    effective,
 )
 from noack.protocol.roles import LOOP_ROLES, RECORDER, Notice
 from noack.runtime.command_line import END_SIGNALS, print_to_stderr

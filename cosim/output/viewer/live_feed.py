@@ -21,14 +21,9 @@ from cosim.record.align import Reals
 from cosim.record.rows import Rows, rows_by_loop
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.linear_systems import Propagator
+from noack.core.packet_rows import NETEM_PACKET
 from noack.core.row_operations import row_norms
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    CONTROLLER_STEP,
-    LOOP,
-    NETEM_PACKET,
-    SENSOR_MEASUREMENT,
-)
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, LOOP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import ResolvedRun, loop_of, tables_of
 
 _TURN_S, _CORE_SHARE = 0.03, 0.3

@@ -25,16 +25,14 @@ from cosim.record.decimation import decimate_all
 from cosim.record.rows import Rows, concatenate_rows, messages_in
 from cosim.record.run_events import claimed_until_s, model_flow
 from noack.core.clock import NS_PER_S
+from noack.core.packet_rows import NETEM_PACKET, Fate, effective
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_SETTING,
     CONTROLLER_STEP,
-    NETEM_PACKET,
     NO_SEQUENCE,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
-    Fate,
-    effective,
 )
 from noack.runtime.host_clocks import CLOCK_NOTICE
 from noack.scenario.resolution import loop_of, policy_of, tables_of

@@ -18,7 +18,7 @@ from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, NETWORK, PLAN
 from cosim.output.viewer.pictures.picture import STILL, Columns, Shape, label, lines, style, upright
 from cosim.record.align import Reals, Times
 from noack.core.clock import NS_PER_S
-from noack.protocol.record_tables import Fate, effective
+from noack.core.packet_rows import Fate, effective
 from noack.protocol.wire_format import Flow
 
 DIAGRAM = "network"

@@ -18,7 +18,8 @@ from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.core.errors import CallerError
 from noack.scenario import toml_file
 from noack.scenario.symbols import ScenarioRoot
-from noack.settings.section import FolderName, MatrixRows, ScenarioSection, Seed
+from noack.settings.section import FolderName, ScenarioSection, Seed
+from noack.settings.values import MatrixRows
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12

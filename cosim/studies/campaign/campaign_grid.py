@@ -25,7 +25,8 @@ from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.resolution import ResolvedRun, policy_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put
-from noack.settings.section import MatrixRows, Table, require_shape
+from noack.settings.section import Table
+from noack.settings.values import MatrixRows, require_shape
 
 SCENARIOS = "scenarios"
 

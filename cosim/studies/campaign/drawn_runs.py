@@ -26,14 +26,8 @@ from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.random_draws import drawn_scenario, seeds_of
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    NETEM_PACKET,
-    NO_SEQUENCE,
-    PLANT_STEP,
-    SENSOR_MEASUREMENT,
-    effective,
-)
+from noack.core.packet_rows import NETEM_PACKET, effective
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import ResolvedRun, policy_of
 from noack.scenario.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.scenario.scenario import Scenario

@@ -18,7 +18,7 @@ from noack.core.number_format import NONE, at_least, at_most
 from noack.core.progress import Progress, no_progress
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, toml_text
-from noack.settings.section import MatrixRows
+from noack.settings.values import MatrixRows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -19,7 +19,7 @@ from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.core.number_format import to_digits
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.settings.section import MatrixRows
+from noack.settings.values import MatrixRows
 from noack.theory.response_bounds import NotDecayingError
 from noack.theory.trigger_norm import input_norm
 

@@ -26,7 +26,7 @@ from noack.core.progress import Progress, no_progress
 from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.settings.section import MatrixRows, rows_of
+from noack.settings.values import MatrixRows, rows_of
 from noack.theory.coverage import require_exact
 from noack.theory.time_triggered.scenario_times import loop_times, without_timeout
 from noack.theory.witnesses.loss_margin import LossMargin, Stability, capped, checked_guarantee, uncapped

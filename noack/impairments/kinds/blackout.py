@@ -12,7 +12,7 @@ from noack.impairments.clauses import Clause, Part, file_name
 from noack.impairments.feature import FileFeature, Impairment, Stage, StageTables, add_numbers
 from noack.impairments.markov_chain import Chain, NotPredictableError
 from noack.impairments.words import OWN_TIME_S, Quantity, time_text
-from noack.settings.user_files import NamedFile
+from noack.settings.named_file import NamedFile
 
 MOST_INTERVALS = 1_000_000
 LATEST_S = 1e9

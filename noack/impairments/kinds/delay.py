@@ -38,8 +38,8 @@ from noack.impairments.words import (
     percent_text,
     time_text,
 )
+from noack.settings.named_file import NamedFile
 from noack.settings.section import Correlation, Table
-from noack.settings.user_files import NamedFile
 
 Distribution = Literal["uniform", "normal", "pareto", "paretonormal", "empirical"]
 SHAPES = tuple(shape for shape in get_args(Distribution) if shape != "empirical")

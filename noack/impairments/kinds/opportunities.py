@@ -21,7 +21,7 @@ from noack.impairments.feature import (
 )
 from noack.impairments.trace_offset import OFFSET, Offset, offset_meaning, offset_ns, require_inside
 from noack.impairments.words import COUNT, SIGNED_COUNT, brief_number, list_of
-from noack.settings.user_files import NamedFile
+from noack.settings.named_file import NamedFile
 
 OPPORTUNITY_BYTES: int = core.NOACK_OPPORTUNITY_BYTES
 MOST_TIMES = 2_000_000

@@ -21,8 +21,8 @@ from noack.impairments.feature import (
 from noack.impairments.markov_chain import NotPredictableError, PeriodicLosses
 from noack.impairments.trace_offset import OFFSET, Offset, offset_meaning, offset_ns, require_inside
 from noack.impairments.words import OWN_TIME_NS, PERCENT, Quantity, brief_number, brief_percent, time_ns_text
+from noack.settings.named_file import NamedFile
 from noack.settings.section import Probability
-from noack.settings.user_files import NamedFile
 from noack.traces.packet_trace import LOST_NS, PacketTrace, find_trace, read_trace
 
 MOST_RECORDS = 1_000_000

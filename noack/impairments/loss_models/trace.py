@@ -10,7 +10,7 @@ from noack.impairments.clauses import Clause, file_name, flag
 from noack.impairments.feature import FileFeature, LossModel, StageTables
 from noack.impairments.loss_models.scripted import MAX_SCRIPT, ScriptedLoss
 from noack.impairments.markov_chain import NotPredictableError, PeriodicLosses
-from noack.settings.user_files import NamedFile
+from noack.settings.named_file import NamedFile
 
 _SPACES = b" \t\r\n\v\f"
 

@@ -24,8 +24,8 @@ from noack.protocol.wire_format import (
     rejected_of,
 )
 from noack.runtime.address import Address, SocketName, packed_name
+from noack.runtime.counting_sockets import CountingSockets, errors_by_text
 from noack.runtime.drivers.real_time_loop import RecordSink
-from noack.runtime.udp_sockets import CountingSockets, errors_by_text
 
 _UDP_GRO = 104
 _AT_ONCE_NS = -(2**63)

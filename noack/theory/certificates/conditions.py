@@ -22,7 +22,8 @@ from noack.references.segment import SolutionSegment
 from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
-from noack.settings.section import MatrixRows, Table
+from noack.settings.section import Table
+from noack.settings.values import MatrixRows
 from noack.theory.certificates.normal_values import normal_limit, with_bounded_values
 from noack.theory.certificates.proven_bounds import ProvenBounds
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.measurement.trace_sources import SourceOptions, read_source, updates_trace
+from cosim.measurement.run_trace import read_source, updates_trace
+from cosim.measurement.trace_sources import SourceOptions
 from cosim.record.run_events import packet_outcomes
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError

@@ -16,7 +16,7 @@ from cosim.output.result_tables import Tone
 from cosim.output.run_verdict import remarks, state_text, verdict
 from cosim.simulation.virtual_time import simulate_run
 from noack.protocol.wire_format import Rejection
-from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
+from noack.runtime.counting_sockets import DROPPED_IN_FLOOD
 from tests.helpers.approved import compare_lines
 from tests.helpers.shipped import shipped
 from tests.helpers.summaries import claim, with_values

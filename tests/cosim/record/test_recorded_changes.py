@@ -14,7 +14,8 @@ from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
-from noack.protocol.record_tables import NETEM_PACKET, NETEM_SETTING
+from noack.core.packet_rows import NETEM_PACKET
+from noack.protocol.record_tables import NETEM_SETTING
 from noack.protocol.roles import Notice
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.parameter_changes import ParameterChange

@@ -17,7 +17,8 @@ from cosim.record.spool_conversion import Segment, finish_record, merge_segments
 from cosim.record.table_files import TableFile, write_table
 from cosim.simulation.virtual_time import simulate_loops
 from noack.core.errors import MachineError
-from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP, network_tables
+from noack.core.packet_rows import NETEM_PACKET
+from noack.protocol.record_tables import LOOP, PLANT_STEP, network_tables
 from noack.protocol.roles import Notice
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 from noack.scenario.resolution import resolve_run

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cosim.record.run_record import RunRecord
-from netem.channel import RUN_ID, Datagram, UserNetwork, channel_of
+from noack.machines.run_channel import RUN_ID, Datagram, UserNetwork, channel_of
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import CHANGEABLE, ENDS, LOOP_ROLES, RECEIVES, RECORDER, Notice, Record, receiver_of
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow

@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 from cosim.simulation.continuous import ContinuousLoop, ContinuousRun, simulate_continuous
 from cosim.simulation.exact_simulation import OK, Events, Population, Setting, run_batch, run_with_events
-from netem.channel import UPDATE_LINK
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.packet_rows import Fate
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.kinds.corrupt import Corrupt
 from noack.impairments.kinds.loss import LossOf
@@ -23,7 +23,7 @@ from noack.impairments.loss_models.lossless import NoLoss
 from noack.impairments.loss_models.periodic_loss import PeriodicLoss
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
-from noack.protocol.record_tables import Fate
+from noack.machines.run_channel import UPDATE_LINK
 from noack.scenario.resolution import LoopMatrices
 from noack.trigger_policies.trigger_rule import QuadraticForm
 from tests.helpers.example_rules import decaying_rule

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.record.run_record import RunRecord
-from netem.channel import UserNetwork
+from noack.machines.run_channel import UserNetwork
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario

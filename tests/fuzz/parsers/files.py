@@ -11,7 +11,8 @@ from unittest.mock import patch
 import numpy as np
 import tomli_w
 
-from cosim.measurement.trace_sources import SourceOptions, read_source
+from cosim.measurement.run_trace import read_source
+from cosim.measurement.trace_sources import SourceOptions
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_grid import grid
 from noack.core.errors import NoackError
@@ -28,7 +29,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, load, validate
 from noack.scenario.toml_file import json_schema
-from noack.settings.user_files import NamedFile
+from noack.settings.named_file import NamedFile
 from tests.fuzz.edits import Choices, Vocabulary, bases, edited, key, quoted, value, vocabulary, write_named
 from tests.fuzz.harness import FOLDER, refusal, workspace
 from tests.oracles.capture_files import (

@@ -7,7 +7,7 @@ import threading
 from contextlib import redirect_stderr
 from pathlib import Path
 
-from netem.control.control_server import running_emulators
+from netem.control.running_emulators import running_emulators
 from netem.relay_watch import watch_relay
 from tests.helpers.waiting import wait_for
 from tests.netem.control.fake_relay import FakeRelay, options

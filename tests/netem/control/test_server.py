@@ -15,14 +15,9 @@ from zenoh.handlers import FifoChannel
 
 from netem.control import control_server, emulator_commands
 from netem.control.command_queue import CommandQueue
-from netem.control.control_server import (
-    EMULATORS,
-    ControlServer,
-    find_emulator,
-    registered_emulator,
-    running_emulators,
-)
+from netem.control.control_server import ControlServer
 from netem.control.emulator_commands import Client
+from netem.control.running_emulators import EMULATORS, find_emulator, registered_emulator, running_emulators
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.connections.zenoh_session import open_session

@@ -12,12 +12,12 @@ from pydantic import ValidationError
 from scipy import stats
 
 from netem.tc_words import settings_of
+from noack.core.packet_rows import Fate
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.target_loss import read_files
-from noack.protocol.record_tables import Fate
 from tests.netem.stepped_link import Link
 
 COUNT = 400_000

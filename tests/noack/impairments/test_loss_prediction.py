@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.channel import Datagram
 from netem.tc_words import settings_of
+from noack.core.packet_rows import Fate
 from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
@@ -20,7 +20,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import LossPrediction, LossProcess, predict
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process, read_files
-from noack.protocol.record_tables import Fate
+from noack.machines.run_channel import Datagram
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.stepped_link import Link
 

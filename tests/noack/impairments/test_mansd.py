@@ -14,16 +14,16 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from netem.channel import Datagram
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import core, ffi
+from noack.core.packet_rows import Fate
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.scripted import ScriptedLoss
-from noack.protocol.record_tables import Fate
+from noack.machines.run_channel import Datagram
 from tests.netem.stepped_link import Link
 from tests.noack.impairments import any_link_settings as any_settings
 from tests.oracles.loss_language import allowed_rows, is_allowed, longest_burst

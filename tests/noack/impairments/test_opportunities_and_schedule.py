@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.tc_words import settings_of
+from noack.core.packet_rows import Fate
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.schedule import Schedule
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.record_tables import Fate
 from tests.netem.stepped_link import Link
 
 MS = 10**6

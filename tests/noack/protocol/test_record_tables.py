@@ -1,11 +1,6 @@
+from noack.core.packet_rows import NETEM_PACKET, PACKET_HEAD_BYTES
 from noack.protocol import wire_format
-from noack.protocol.record_tables import (
-    NETEM_PACKET,
-    OWNER,
-    PACKET_HEAD_BYTES,
-    SENSOR_ACKNOWLEDGEMENT,
-    tables,
-)
+from noack.protocol.record_tables import OWNER, SENSOR_ACKNOWLEDGEMENT, tables
 from noack.protocol.roles import LOOP_ROLES
 
 

@@ -14,8 +14,9 @@ from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow
 from noack.runtime import udp_sockets
 from noack.runtime.address import LOOPBACK, Address, address_text, family_of, parse_address, parse_destination
+from noack.runtime.counting_sockets import DROPPED_IN_FLOOD, SourceCount, bind, open_beside
 from noack.runtime.drivers.live_driver import LoopSockets
-from noack.runtime.udp_sockets import DROPPED_IN_FLOOD, SourceCount, bind, enlarge_buffer, open_beside
+from noack.runtime.udp_sockets import enlarge_buffer
 from tests.noack.runtime.drivers.live_loops import Live, measurement, scenario
 
 

@@ -6,7 +6,7 @@ import pytest
 
 import noack
 from noack.core.errors import CallerError
-from noack.settings.user_files import NamedFile
+from noack.settings.named_file import NamedFile
 
 
 def test_only_regular_files_are_read(tmp_path: Path) -> None:

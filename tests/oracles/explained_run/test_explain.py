@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate_loops
-from noack.protocol.record_tables import NO_SEQUENCE, Fate
+from noack.core.packet_rows import Fate
+from noack.protocol.record_tables import NO_SEQUENCE
 from noack.scenario.resolution import resolve_run
 from noack.theory.certificates.conditions import ideal_conditions
 from tests.cosim.record.changed_records import changed, copied

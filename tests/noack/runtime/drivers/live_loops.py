@@ -13,8 +13,8 @@ from noack.core.clock import RunClock
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.roles import SENDS, Notice, Record
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
+from noack.runtime.counting_sockets import bind
 from noack.runtime.drivers.live_driver import LiveDriver, LoopSockets
-from noack.runtime.udp_sockets import bind
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
