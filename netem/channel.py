@@ -39,9 +39,7 @@ class Channel:
             (:meth:`answer`).
     """
 
-    def __init__(
-        self, links: Sequence[LinkState], *, flows: int = 1, asks: bool = False
-    ) -> None:
+    def __init__(self, links: Sequence[LinkState], *, flows: int = 1, asks: bool = False) -> None:
         self._links = tuple(links)
         for number, link in enumerate(links):
             for flow in range(flows):

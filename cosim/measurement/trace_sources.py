@@ -1,8 +1,8 @@
 """Packet traces from all that can be measured.
 
-The sources are files of known formats, and the delivery opportunities of mahimahi. The latter say when the link could deliver,
-and nothing about losses. So their trace is that of a simulated probe through the emulator's link:
-its delays are those of waiting for the next opportunity.
+The sources are files of known formats, and the delivery opportunities of mahimahi. The latter say
+when the link could deliver, and nothing about losses. So their trace is that of a simulated probe
+through the emulator's link: its delays are those of waiting for the next opportunity.
 """
 
 import re

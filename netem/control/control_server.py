@@ -1,8 +1,9 @@
 """Live control of a running emulator by zenoh: its queries.
 
-It listens on a Unix socket beside its file (:mod:`netem.control.running_emulators`). Below ``netem/NAME`` it answers ``report``, ``settings`` and ``change``, and
-publishes ``statistics`` once a second, as docs/netem-control.md describes, in a thread of its own.
-A query with a mistake is answered with one line, and changes nothing.
+It listens on a Unix socket beside its file (:mod:`netem.control.running_emulators`). Below
+``netem/NAME`` it answers ``report``, ``settings`` and ``change``, and publishes ``statistics`` once a
+second, as docs/netem-control.md describes, in a thread of its own. A query with a mistake is answered
+with one line, and changes nothing.
 """
 
 import json
@@ -21,7 +22,7 @@ from netem.control.emulator_statistics import Statistics, StatisticsThread
 from netem.control.running_emulators import EMULATORS, registered_emulator
 from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of, words_of
-from noack.core.errors import CallerError, MachineError, NoackError, PeerError
+from noack.core.errors import CallerError, MachineError, NoackError
 from noack.core.json_text import parse_json
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import with_target_loss

@@ -8,7 +8,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-Matrix = Vector = NDArray[np.float64]
+Reals = NDArray[np.float64]
 
 _SMALLEST_SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""
@@ -16,7 +16,7 @@ _MOST_IN_TURN = 8
 """numpy, too, adds fewer terms one after the other, but takes ten times as long for many short rows."""
 
 
-def row_norms(rows: Matrix) -> Vector:
+def row_norms(rows: Reals) -> Reals:
     """Return the Euclidean norms of k vectors, (k, n) → (k,), without overflow of squares.
 
     If the squares are safe, the results equal numpy's bit-exactly.
@@ -42,7 +42,7 @@ def all_entries(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(reduce(np.logical_and, holds.T))
 
 
-def set_rows(matrix: Matrix, places: NDArray[np.intp], rows: Matrix) -> None:
+def set_rows(matrix: Reals, places: NDArray[np.intp], rows: Reals) -> None:
     """Set the rows of a matrix at k places to others, (k, n), entry by entry.
 
     ``matrix[places] = rows`` takes ten times as long for many short rows. Neither should rows be
@@ -52,7 +52,7 @@ def set_rows(matrix: Matrix, places: NDArray[np.intp], rows: Matrix) -> None:
         column[places] = entries
 
 
-def largest_sizes(rows: Matrix) -> Vector:
+def largest_sizes(rows: Reals) -> Reals:
     """Return the size of the largest entry of each row, (k, n) → (k,); NaN if there is a NaN."""
     return np.asarray(reduce(np.maximum, np.abs(rows).T))
 

@@ -37,9 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "belong to an emulator on its own, which needs --listen and --to, or --links"
             )
     except NoackError as error:
-        return report_failure(
-            str(error), error.exit_status, source="noack netem", as_json="--json" in words
-        )
+        return report_failure(str(error), error.exit_status, source="noack netem", as_json="--json" in words)
     return run_emulator(words, _emulator_parser())
 
 

@@ -13,7 +13,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, PACKET_HEAD_BYTES, Fate
 from noack.protocol.wire_format import Flow

@@ -15,12 +15,12 @@ from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, ClassVar, NoReturn, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
-from noack.core.errors import CallerError, NoackError, one_line
+from noack.core.errors import NoackError, one_line
 from noack.core.linear_systems import Vector
 from noack.settings.named_file import NamedFile
 from noack.settings.section import ScenarioSection

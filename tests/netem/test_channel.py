@@ -9,12 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.channel import Channel
 from netem.link_state import LinkState
 from noack.core.core_library import new_handle
 from noack.core.packet_rows import PACKET_HEAD_BYTES, Fate
 from noack.impairments.link_settings import LinkSettings
-from noack.machines.run_channel import Datagram, channel_of
+from noack.machines.run_channel import Datagram, RunChannel, channel_of
 from noack.protocol.roles import Record
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
