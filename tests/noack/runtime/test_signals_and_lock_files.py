@@ -66,7 +66,8 @@ TERM = (signal.SIGTERM, 143, "stopped on request (SIGTERM)")
     ("words", "ended"),
     [
         (["cosim.cli", "typer", "--version"], INT),
-        (["netem", "netem.channel", "--help"], INT),
+        (["netem", "noack.core.system_processes", "--help"], INT),
+        (["noack.network_process", "netem.channel", "--help"], INT),
         (["plant_server", "noack.runtime.run_process", "--help"], TERM),
     ],
 )

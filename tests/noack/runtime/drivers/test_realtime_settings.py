@@ -28,7 +28,7 @@ def test_a_receiver_interrupts_its_sender_and_the_loop_the_other_threads(
     for place, own in enumerate(expected):
         given.clear()
         with ExitStack() as undo:
-            _set_fifo_priority(priority, place, undo)
+            _set_fifo_priority(priority, place, len(expected), undo)
         first, *others, last = given
         assert (first, last) == ((threading.get_native_id(), own), (0, 0))
         assert {rank for _, rank in others} <= {max(priority - 4, 1)}

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow
-from noack.runtime import udp_sockets
+from noack.runtime import counting_sockets
 from noack.runtime.address import LOOPBACK, Address, address_text, family_of, parse_address, parse_destination
 from noack.runtime.counting_sockets import DROPPED_IN_FLOOD, SourceCount, bind, open_beside
 from noack.runtime.drivers.live_driver import LoopSockets
@@ -101,7 +101,7 @@ def test_a_process_needs_a_socket_for_each_peer(
 ) -> None:
     own = (LOOPBACK, 9)
     with closing(Live("sensor", [scenario(content)])) as live, closing(bind(0, "port")) as endpoint:
-        monkeypatch.setattr(udp_sockets, "open_beside", lambda endpoint, peers: ())
+        monkeypatch.setattr(counting_sockets, "open_beside", lambda endpoint, peers: ())
         with pytest.raises(PeerError, match="refused to open a socket for each peer"):
             LoopSockets(endpoint, live.driver, Flow.UPDATE, source=own, destination=own)
 
