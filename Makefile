@@ -207,7 +207,7 @@ dist: setup-dev ## Build the sdist, and from it the wheels for Linux, macOS and 
 
 clean: ## Remove the environment and caches, not runs/
 	rm -rf $(VENV) site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache \
-		noack/core/libnoack.so noack/core/_core_header.py
+		netem/core/libnoack.so netem/core/_core_header.py
 
 $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "noack needs Python >= 3.11; none found (set PYTHON=...)" >&2; exit 2; }

@@ -23,9 +23,9 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 from benchmarks import cases
 from benchmarks.machine_load import MachineLoad
 from benchmarks.report import BENCHMARKS, Benchmark, MeasurementError, Row, print_table
-from noack.core.errors import NoackError, why
-from noack.core.file_access import write_whole
-from noack.runtime.command_line import Parser
+from netem.core.command_line import Parser
+from netem.core.errors import NoackError, why
+from netem.core.file_access import write_whole
 
 GOALS = (
     "latency", "startup", "simulation", "long_run", "many_loops", "batch", "relays", "relay_delay",

@@ -42,7 +42,7 @@ static void request(const char *setting, int succeeded) {
         fprintf(stderr, "%s: not permitted: %s\n", setting, strerror(errno));
 }
 
-/* The settings of noack/runtime/drivers/realtime_settings.py. */
+/* The settings of netem/core/realtime_settings.py. */
 static void apply_settings(int priority, int place) {
     if (priority == 0)
         return;

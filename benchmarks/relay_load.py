@@ -23,7 +23,7 @@ from cffi import FFI
 from benchmarks.programs import RELAY_CORE, compile_program, program_path
 from benchmarks.report import MeasurementError
 from benchmarks.rounds import Figures, Rounds
-from noack.runtime.address import LOOPBACK
+from netem.core.address import LOOPBACK
 from tests.helpers.waiting import wait_for
 
 BURST = 8000

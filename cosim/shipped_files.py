@@ -5,9 +5,9 @@ import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
-from noack.core.errors import CallerError, did_you_mean, shortened
-from noack.core.extension_points import missing_extension
-from noack.core.file_access import shipped_files
+from netem.core.errors import CallerError, did_you_mean, shortened
+from netem.core.extension_points import missing_extension
+from netem.core.file_access import shipped_files
 
 KINDS = ("scenarios", "campaigns")
 """Kinds of shipped files, and their folders."""

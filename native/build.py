@@ -24,7 +24,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-INTO = HERE.parent / "noack" / "core"
+INTO = HERE.parent / "netem" / "core"
 LIBRARY, HEADER = "libnoack.so", "_core_header.py"
 PLATFORMS = {
     "manylinux_2_17_x86_64": "x86_64-linux-gnu.2.17",
@@ -207,7 +207,7 @@ def _write_declarations(into: Path, target: str) -> None:
 
     ffi = FFI()
     ffi.cdef(declarations())
-    ffi.set_source("noack.core._core_header", None)
+    ffi.set_source("netem.core._core_header", None)
     path = into / HEADER
     with redirect_stdout(io.StringIO()):  # cffi prints its progress
         ffi.emit_python_code(str(path))

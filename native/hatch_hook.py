@@ -42,7 +42,7 @@ class CoreHook(BuildHookInterface):
             build["build"](folder, target=tag)
             self._scratch = folder
         for name in (build["LIBRARY"], build["HEADER"]):
-            build_data["force_include"][str(folder / name)] = f"noack/core/{name}"
+            build_data["force_include"][str(folder / name)] = f"netem/core/{name}"
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{tag}"
 

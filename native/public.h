@@ -1,6 +1,6 @@
 /* What Python uses of the core: numbers, wire and clock here; each room has its own public.h.
 
-   native/build.py gives these files, in the order of core.h, to cffi, and noack/core/core_library.py
+   native/build.py gives these files, in the order of core.h, to cffi, and netem/core/core_library.py
    makes numpy's row types of them. Therefore they have declarations, enumerations and comments only;
    every number is a double or an integer of a stated width. Times are integer nanoseconds. What
    noack_..._new returns owns its memory, until noack_..._free. Machines, link and simulators call no
@@ -38,7 +38,7 @@ void noack_exponential(int64_t n, const double *matrix, double *result, double *
 
 /* ---- The clock of a run ---------------------------------------------------------------------- */
 
-/* The clock of a run, as noack.core.clock: simulated time since the run's epoch. */
+/* The clock of a run, as netem.core.clock: simulated time since the run's epoch. */
 typedef struct {
     int64_t epoch_ns; /* reading of this host's monotonic clock at simulated time 0 */
     double speed;     /* simulated time per time of that clock */

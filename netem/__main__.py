@@ -9,13 +9,13 @@
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.command_line import stoppable_imports
+from netem.core.command_line import stoppable_imports
 
 with stoppable_imports():
-    from noack.core.errors import ExitStatus, NoackError
-    from noack.core.system_processes import exhausted_limit
-    from noack.runtime.command_line import Parser, report_failure, why_not_written
-    from noack.runtime.standard_streams import guard_streams
+    from netem.core.command_line import Parser, report_failure, why_not_written
+    from netem.core.errors import ExitStatus, NoackError
+    from netem.core.standard_streams import guard_streams
+    from netem.core.system_processes import exhausted_limit
 
 COMMANDS = ("show", "set", "watch", "shell")
 """First words that are commands."""

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from netem.core.core_library import CData, core, ffi, new_handle, pointer_to, rows_at
+from netem.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, PACKET_ROW
+from netem.impairments.link_settings import LinkSettings
 from netem.link_state import LinkState
-from noack.core.core_library import CData, core, ffi, new_handle, pointer_to, rows_at
-from noack.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, PACKET_ROW
-from noack.impairments.link_settings import LinkSettings
 
 Rows = NDArray[np.void]
 

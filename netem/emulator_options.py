@@ -7,18 +7,18 @@ import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
+from netem.core.address import parse_address, parse_destination
+from netem.core.command_line import Parser
+from netem.core.errors import CallerError
+from netem.core.number_checks import whole_number
+from netem.core.settings_section import LARGEST_SEED
+from netem.impairments.burst_prediction import USUAL_PACKETS, read_within
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.target_loss import read_files
+from netem.impairments.words import OWN_TIME_S
 from netem.links_file import load_links
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import GRAMMAR, KEYWORDS, parse, require_no_dashes, settings_of
-from noack.core.errors import CallerError
-from noack.core.number_checks import whole_number
-from noack.impairments.burst_prediction import USUAL_PACKETS, read_within
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.target_loss import read_files
-from noack.impairments.words import OWN_TIME_S
-from noack.runtime.address import parse_address, parse_destination
-from noack.runtime.command_line import Parser
-from noack.settings.section import LARGEST_SEED
 
 LINK_NAME = "relay"
 """Name of the link that the command line describes."""

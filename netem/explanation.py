@@ -11,18 +11,18 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from netem.core.address import address_text
+from netem.core.console import SafeConsole
+from netem.core.errors import shortened
+from netem.impairments.burst_prediction import BurstPrediction, caps_with, chance_text, predict_bursts
+from netem.impairments.feature import Impairment
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.loss_prediction import order_and_notes
+from netem.impairments.markov_chain import NotPredictableError
+from netem.impairments.target_loss import expected_loss, loss_process, with_target_loss
+from netem.impairments.words import percent_text
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import words_of
-from noack.core.errors import shortened
-from noack.impairments.burst_prediction import BurstPrediction, caps_with, chance_text, predict_bursts
-from noack.impairments.feature import Impairment
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import order_and_notes
-from noack.impairments.markov_chain import NotPredictableError
-from noack.impairments.target_loss import expected_loss, loss_process, with_target_loss
-from noack.impairments.words import percent_text
-from noack.runtime.address import address_text
-from noack.runtime.console import SafeConsole
 
 _MAX_TOML = 4000
 """Longest settings that are printed, in characters."""

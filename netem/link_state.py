@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import CData, core, dtype_of, ffi, new_handle, pointer_to, require, rows_at
-from noack.core.random_streams import stream_key
-from noack.guarantee.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
-from noack.impairments.feature import Stage, StageTables
-from noack.impairments.link_settings import Counters, LinkSettings
-from noack.impairments.target_loss import with_target_loss
+from netem.core.core_library import CData, core, dtype_of, ffi, new_handle, pointer_to, require, rows_at
+from netem.core.random_streams import stream_key
+from netem.guarantee.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
+from netem.impairments.feature import Stage, StageTables
+from netem.impairments.link_settings import Counters, LinkSettings
+from netem.impairments.target_loss import with_target_loss
 
 Integers = NDArray[np.int64]
 _COUNTED = dtype_of("noack_counters").names or ()

@@ -6,14 +6,14 @@ from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
+from netem.core import toml_file
+from netem.core.address import parse_address, parse_destination
+from netem.core.errors import CallerError
+from netem.core.settings_section import FolderName, ScenarioSection, Seed, Table
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.target_loss import read_files
 from netem.relay.relay_links import STREAM, LinkSpec
 from netem.tc_words import settings_of
-from noack.core.errors import CallerError
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.target_loss import read_files
-from noack.runtime.address import parse_address, parse_destination
-from noack.scenario import toml_file
-from noack.settings.section import FolderName, ScenarioSection, Seed, Table
 
 
 def _settings(value: object) -> LinkSettings:

@@ -14,16 +14,16 @@ from typing import Self
 
 from netem.control.command_queue import CommandQueue, Snapshot
 from netem.control.emulator_statistics import DirectionStatistics, LinkStatistics, statistics
+from netem.core.address import Address, address_text, parse_address, parse_destination
+from netem.core.errors import CallerError, why
+from netem.core.number_checks import whole_number
+from netem.core.settings_section import LARGEST_SEED
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.target_loss import read_files
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of
-from noack.core.errors import CallerError, why
-from noack.core.number_checks import whole_number
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.target_loss import read_files
-from noack.runtime.address import Address, address_text, parse_address, parse_destination
-from noack.settings.section import LARGEST_SEED
 
 
 class LossyUdp:

@@ -14,11 +14,11 @@ from pathlib import Path
 
 from netem.control.command_queue import CommandQueue
 from netem.control.emulator_statistics import Statistics, StatisticsThread
+from netem.core.command_line import LogFormat, discard_output
+from netem.core.errors import CallerError, why
+from netem.core.file_access import open_growing
 from netem.relay.relay import Relay
 from netem.relay.relay_reports import report_line
-from noack.core.errors import CallerError, why
-from noack.core.file_access import open_growing
-from noack.runtime.command_line import LogFormat, discard_output
 
 _SWITCH_S = 0.0002
 """Maximum time for which another thread holds the interpreter lock before the relay's thread."""

@@ -15,6 +15,11 @@ from typing import Protocol
 from netem.control.emulator_statistics import Statistics, statistics, unintended_losses
 from netem.control.running_emulators import starting
 from netem.control.statistics_text import statistics_lines
+from netem.core.address import address_text
+from netem.core.command_line import Parser, Signals, log_event, log_format, report_failure
+from netem.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
+from netem.core.number_format import counted
+from netem.core.realtime_settings import realtime
 from netem.emulator_options import command_line_parser, explained_packets, parse_options, specs_of
 from netem.explanation import explain
 from netem.relay.link_sockets import raise_file_limit
@@ -22,11 +27,6 @@ from netem.relay.relay import Relay
 from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.relay.relay_reports import report_line
 from netem.relay_watch import add_watching_options, check_watching_options, watch_relay
-from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
-from noack.core.number_format import counted
-from noack.runtime.address import address_text
-from noack.runtime.command_line import Parser, Signals, log_event, log_format, report_failure
-from noack.runtime.drivers.realtime_settings import realtime
 
 _FIFO_PRIORITY = 50
 """As the controller of a run has it by default."""

@@ -12,14 +12,14 @@ from typing import NamedTuple, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from noack.core.errors import CallerError, plain_mistake
-from noack.impairments.constraints import CONSTRAINTS, AnyConstraint
-from noack.impairments.feature import Constraint, Feature, Impairment
-from noack.impairments.kinds import IMPAIRMENTS, AnyImpairment
-from noack.impairments.kinds.reorder import Reorder
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.words import COUNT, WordReader
-from noack.settings.section import Seed, Table
+from netem.core.errors import CallerError, plain_mistake
+from netem.core.settings_section import Seed, Table
+from netem.impairments.constraints import CONSTRAINTS, AnyConstraint
+from netem.impairments.feature import Constraint, Feature, Impairment
+from netem.impairments.kinds import IMPAIRMENTS, AnyImpairment
+from netem.impairments.kinds.reorder import Reorder
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.words import COUNT, WordReader
 
 T = TypeVar("T")
 _REFUSED = {

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from cosim.studies.new_loop.linear_model import gain as gain
     from cosim.studies.new_loop.linear_model import linearise as linearise
     from cosim.studies.new_loop.new_scenario import new as new
+    from netem.core.errors import NoackError as NoackError
     from netem.lossy_udp import LossyUdp as LossyUdp
-    from noack.core.errors import NoackError as NoackError
     from noack.scenario.scenario import Scenario as Scenario
 
     __version__: str
@@ -55,7 +55,7 @@ else:
         if module is None:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         if name in _ON_LINUX:
-            from noack.core.core_library import require_live_runs
+            from netem.core.core_library import require_live_runs
 
             require_live_runs()
         value = getattr(import_module(module), name)
@@ -85,7 +85,7 @@ _NAMES = {
     "cosim.studies.new_loop.linear_model": ("gain", "linearise"),
     "cosim.studies.new_loop.new_scenario": ("new",),
     "netem.lossy_udp": ("LossyUdp",),
-    "noack.core.errors": ("NoackError",),
+    "netem.core.errors": ("NoackError",),
     "noack.scenario.scenario": ("Scenario",),
 }
 """The names of the library, by module."""

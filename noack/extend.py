@@ -5,22 +5,29 @@ itself: a module that uses it as well as kinds imports it within functions, beca
 while noack is loaded. ``docs/extending.md`` describes how an extension is made.
 """
 
+from netem.core.clock import NS_PER_S as NS_PER_S
+from netem.core.errors import CallerError as CallerError
+from netem.core.errors import MachineError as MachineError
+from netem.core.errors import NoackError as NoackError
+from netem.core.errors import one_line as one_line
+from netem.core.errors import shortened as shortened
+from netem.core.errors import why as why
+from netem.core.file_access import new_file as new_file
+from netem.core.named_file import NamedFile as NamedFile
+from netem.core.periods import exact_ns as exact_ns
+from netem.core.periods import nearest_ns as nearest_ns
+from netem.core.settings_section import NonNegative as NonNegative
+from netem.core.settings_section import Positive as Positive
+from netem.core.settings_section import Probability as Probability
+from netem.core.settings_section import ScenarioSection as ScenarioSection
+from netem.core.settings_section import Seed as Seed
+from netem.core.settings_section import Table as Table
 from noack.controllers.controller_settings import ControlFailedError as ControlFailedError
 from noack.controllers.controller_settings import ControlLaw as ControlLaw
 from noack.controllers.controller_settings import ControllerSettings as ControllerSettings
 from noack.controllers.controller_settings import ControlModel as ControlModel
-from noack.core.clock import NS_PER_S as NS_PER_S
-from noack.core.errors import CallerError as CallerError
-from noack.core.errors import MachineError as MachineError
-from noack.core.errors import NoackError as NoackError
-from noack.core.errors import one_line as one_line
-from noack.core.errors import shortened as shortened
-from noack.core.errors import why as why
-from noack.core.file_access import new_file as new_file
 from noack.core.linear_systems import Matrix as Matrix
 from noack.core.linear_systems import Vector as Vector
-from noack.core.periods import exact_ns as exact_ns
-from noack.core.periods import nearest_ns as nearest_ns
 from noack.disturbances.disturbance_settings import DisturbanceSettings as DisturbanceSettings
 from noack.disturbances.disturbance_settings import SignalSource as SignalSource
 from noack.plants.plant_settings import EquationSettings as EquationSettings
@@ -43,13 +50,6 @@ from noack.protocol.record_tables import TABLES as TABLES
 from noack.protocol.record_tables import entry_names as entry_names
 from noack.protocol.roles import External as External
 from noack.protocol.wire_format import MAX_DIMENSION as MAX_DIMENSION
-from noack.settings.named_file import NamedFile as NamedFile
-from noack.settings.section import NonNegative as NonNegative
-from noack.settings.section import Positive as Positive
-from noack.settings.section import Probability as Probability
-from noack.settings.section import ScenarioSection as ScenarioSection
-from noack.settings.section import Seed as Seed
-from noack.settings.section import Table as Table
 from noack.settings.user_files import FileSettings as FileSettings
 from noack.settings.user_files import checked_path as checked_path
 from noack.settings.user_files import real_vector as real_vector

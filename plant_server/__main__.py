@@ -3,10 +3,10 @@
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.command_line import stoppable_imports
+from netem.core.command_line import stoppable_imports
 
 with stoppable_imports():
-    from noack.core.errors import ExitStatus
+    from netem.core.errors import ExitStatus
     from noack.runtime.join_run import join_run
     from noack.runtime.run_process import run_machines
     from plant_server.plant import plants_of

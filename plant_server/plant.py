@@ -26,11 +26,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.clock import NEVER_NS, NS_PER_S
-from noack.core.core_library import CData, core, reals_at
+from netem.core.clock import NEVER_NS, NS_PER_S
+from netem.core.core_library import CData, core, reals_at
+from netem.core.periods import ANY_PERIOD, Period
+from netem.core.random_streams import normals, uniforms
 from noack.core.linear_systems import Matrix, Vector, discretise, product, transition
-from noack.core.periods import ANY_PERIOD, Period
-from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import Place, SignalSource
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, TransitionMatrices, parts_of
 from noack.plants.linear import LinearSystem

@@ -9,8 +9,8 @@ import typer
 import yaml
 
 from cosim.cli.application import app
+from netem.core.command_line import Parser
 from noack.protocol.roles import LOOP_ROLES
-from noack.runtime.command_line import Parser
 from noack.runtime.join_run import add_options
 from tests.helpers.pages import ROOT
 

@@ -25,17 +25,17 @@ from cosim.studies.campaign.campaign_file import Campaign, CampaignAxis, Figure,
 from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.metrics import METRICS
+from netem.core.number_format import at_most, number
+from netem.core.toml_file import json_schema
+from netem.impairments.constraints import CONSTRAINTS
+from netem.impairments.disciplines import DISCIPLINES
+from netem.impairments.kinds import IMPAIRMENTS
+from netem.impairments.loss_models import LOSS_MODELS
 from netem.tc_words import KEYWORDS
 from noack.controllers.controller_settings import ControllerSettings
-from noack.core.number_format import at_most, number
-from noack.impairments.constraints import CONSTRAINTS
-from noack.impairments.disciplines import DISCIPLINES
-from noack.impairments.kinds import IMPAIRMENTS
-from noack.impairments.loss_models import LOSS_MODELS
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES, AnyDisturbance, AnyObserver
-from noack.scenario.toml_file import json_schema
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions
 from noack_check.keys import key_table

@@ -59,7 +59,7 @@ def test_an_extension_imports_public_names_alone() -> None:
 
 
 WALL_CLOCK = {
-    "noack/runtime/command_line.py": "lines of the log",
+    "netem/core/command_line.py": "lines of the log",
     "cosim/record/run_directory.py": "the run's name and its environment",
     "cosim/live/coordination/change_requests.py": "when a change was requested",
     "cosim/live/coordination/certificate_authority.py": "the validity of a run's certificates",

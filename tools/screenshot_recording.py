@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from cosim.output.viewer.recording_viewer import RecordingServer
-from noack.core.errors import CallerError, MachineError, NoackError
-from noack.core.system_processes import python_command
+from netem.core.errors import CallerError, MachineError, NoackError
+from netem.core.system_processes import python_command
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (

@@ -32,7 +32,7 @@ def write_all(names: list[str], folder: Path) -> int:
     """Write proofs; return 1 if a bound grew."""
     from cosim.analysis import witness_store
     from cosim.analysis.witnesses import find_witnesses
-    from noack.core.errors import CallerError
+    from netem.core.errors import CallerError
 
     shipped, found = witness_store.SHIPPED, folder / "noack" / "witnesses"
     shipped.mkdir(exist_ok=True)
@@ -79,7 +79,7 @@ def servo(folder: Path) -> Path:
     text = (ROOT / "README.md").read_text()
     program = re.search(r"```python\n(# servo\.py\n.*?)```", text, re.DOTALL)
     assert program is not None
-    from noack.core.system_processes import python_command
+    from netem.core.system_processes import python_command
 
     (folder / "servo.py").write_text(program[1])
     elsewhere = os.environ | {"XDG_CACHE_HOME": str(folder / "servo")}  # what it tries is no proof of it

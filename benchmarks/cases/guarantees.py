@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import ZERO, Goal, Peer, Row, announce, benchmark
+from netem.impairments.target_loss import expected_loss
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
-from noack.impairments.target_loss import expected_loss
 from tests.oracles.loss_language import is_allowed, longest_burst, outcomes_of
 
 DECISIONS = 100_000_000

@@ -24,12 +24,12 @@ from cosim.simulation.exact_simulation import Population, Setting, run_batch, ru
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.random_draws import box_of
-from noack.core.clock import NS_PER_S
-from noack.core.core_library import core, ffi
+from netem.core.clock import NS_PER_S
+from netem.core.core_library import core, ffi
+from netem.core.realtime_settings import realtime
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.wire_format import Flow
-from noack.runtime.drivers.realtime_settings import realtime
 from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate

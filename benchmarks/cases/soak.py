@@ -20,8 +20,8 @@ from benchmarks.programs import set_options
 from benchmarks.report import ZERO, Goal, MeasurementError, Row, benchmark
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import load_record
-from noack.core.file_access import create_folder, write_whole
-from noack.core.packet_rows import NETEM_RELEASE
+from netem.core.file_access import create_folder, write_whole
+from netem.core.packet_rows import NETEM_RELEASE
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.spool import SPOOL
 from noack.scenario.scenario_file import load

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 from cosim.analysis.tried_settings import replaced
 from cosim.analysis.witnesses import find_statement
-from noack.core.errors import NoackError
-from noack.core.number_format import at_most, to_digits
+from netem.core.errors import NoackError
+from netem.core.number_format import at_most, to_digits
 from noack.core.progress import Progress
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from noack.core.number_format import NONE, at_least, at_most
+from netem.core.number_format import NONE, at_least, at_most
 from noack.theory.certificates.certified_bounds import Quantity, ScenarioCertificate
 from noack.theory.certificates.conditions import BOX
 from noack.theory.certificates.output_bounds import OutputBound

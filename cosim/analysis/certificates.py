@@ -10,9 +10,9 @@ from cosim.analysis.certificate_rows import certificate_rows, covered_plants
 from cosim.analysis.scenario_certificates import certificate_of
 from cosim.analysis.tried_settings import TriedSettings, helpful_box, helpful_settings, largest_settings
 from cosim.analysis.witnesses import Unproven, Witnesses, find_witnesses, with_lateness
-from noack.core.errors import CallerError
-from noack.core.number_checks import whole_number
-from noack.core.number_format import TextRows, as_html, as_text
+from netem.core.errors import CallerError
+from netem.core.number_checks import whole_number
+from netem.core.number_format import TextRows, as_html, as_text
 from noack.core.progress import Progress, no_progress
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario

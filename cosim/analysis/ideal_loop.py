@@ -17,7 +17,7 @@ from cosim.simulation.continuous import (
     network_fates,
     simulate_continuous,
 )
-from noack.core.errors import NoackError
+from netem.core.errors import NoackError
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_STEP
 from noack.scenario.scenario import Scenario
 from noack.theory.coverage import require_exact

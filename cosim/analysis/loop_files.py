@@ -1,7 +1,7 @@
 """The loop document of a scenario's statement and the proof of its bounds, with the scenario's names."""
 
 from cosim.analysis.witnesses import WitnessedStatement, Witnesses
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.proof.files import ProofFiles, proof_files
 from noack.proof.gains_document import GainsFiles, gains_files
 from noack.proof.loop_document import Naming, NoDocumentError

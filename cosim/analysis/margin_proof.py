@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from noack.core.number_format import at_least, at_most
+from netem.core.number_format import at_least, at_most
 from noack.proof.forms_proof import FORMAT, as_text
 from noack.proof.period_document import PeriodDocument
 from noack.proof.period_graph import PeriodGraph, each_step

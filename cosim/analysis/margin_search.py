@@ -11,16 +11,16 @@ from typing import NamedTuple
 
 from cosim.analysis.certificates import CertificateAnswer, answer_for
 from cosim.analysis.margin_proof import MarginProof, margin_proof
+from netem.core.clock import NS_PER_S
+from netem.core.command_line import StopRequestError
+from netem.core.errors import CallerError
+from netem.core.number_checks import real_number, whole_number
+from netem.core.number_format import at_least, at_most
+from netem.guarantee.loss_guarantee import LossGuarantee, OutcomePattern, find_counterexample, outcome_letters
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.markov_chain import NotPredictableError
+from netem.impairments.target_loss import loss_process
 from netem.tc_words import guarantee_words, settings_of
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
-from noack.core.number_checks import real_number, whole_number
-from noack.core.number_format import at_least, at_most
-from noack.guarantee.loss_guarantee import LossGuarantee, OutcomePattern, find_counterexample, outcome_letters
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.markov_chain import NotPredictableError
-from noack.impairments.target_loss import loss_process
-from noack.runtime.command_line import StopRequestError
 from noack.scenario.arrival_ties import late_inputs
 from noack.scenario.scenario import Scenario
 from noack.theory.random_losses.mean_square_growth import MeanSquareGrowth, growth_without_guarantee

@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, one_line, shortened
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError, one_line, shortened
+from netem.core.number_format import number
+from netem.guarantee.loss_guarantee import LossGuarantee
+from netem.impairments.markov_chain import NotPredictableError
+from netem.impairments.target_loss import loss_process
 from noack.core.linear_systems import Matrix
-from noack.core.number_format import number
-from noack.guarantee.loss_guarantee import LossGuarantee
-from noack.impairments.markov_chain import NotPredictableError
-from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.random_losses.exact_moments import LoopMoments, LoopPeriods, periods_of, start_of

@@ -11,14 +11,14 @@ from typing import NamedTuple
 
 from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.analysis.witnesses import plants_of
-from noack.core.clock import NS_PER_S
-from noack.core.errors import NoackError
-from noack.core.number_format import to_digits
+from netem.core.clock import NS_PER_S
+from netem.core.errors import NoackError
+from netem.core.number_format import to_digits
+from netem.core.settings_section import Table
 from noack.scenario.overload import refuse_overload
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from noack.settings.section import Table
 from noack.theory.certificates.conditions import certified_delay_s
 
 _MOST_TRIALS = 24

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat
 
-from noack.core.file_access import create_folder, new_file, open_regular, remove_file
+from netem.core.file_access import create_folder, new_file, open_regular, remove_file
 from noack_check.loop import Loop
 
 SHIPPED, INDEX = Path(__file__).parent / "shipped_proofs", "index.json"

@@ -18,12 +18,12 @@ from cosim.shipped_files import find_shipped
 from cosim.studies.campaign import campaign_figures, campaign_file, campaign_report, campaign_summary
 from cosim.studies.campaign.campaign_report import FinishedCampaign
 from cosim.studies.campaign.campaign_workers import local_runner, worker_count
-from noack.core.errors import CallerError
-from noack.core.number_format import TextRows, as_html, as_text
+from netem.core.console import SafeConsole
+from netem.core.errors import CallerError
+from netem.core.number_format import TextRows, as_html, as_text
+from netem.core.toml_file import validated
 from noack.core.progress import Progress
-from noack.runtime.console import SafeConsole
 from noack.scenario.given_settings import plain_table
-from noack.scenario.toml_file import validated
 
 _TABLE = Path("campaign")
 """Stands for the file of a campaign that is given as a table."""

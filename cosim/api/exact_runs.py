@@ -11,8 +11,8 @@ from cosim.output.curves import Curve
 from cosim.output.document import Sentence
 from cosim.output.run_verdict import verdict_of_exact_run
 from cosim.simulation import continuous
+from netem.core.number_checks import whole_number
 from noack.core.linear_systems import Matrix, Vector
-from noack.core.number_checks import whole_number
 from noack.scenario.resolution import policy_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.trigger_policies.trigger_rule import TriggerRule

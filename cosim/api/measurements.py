@@ -7,16 +7,16 @@ from typing import Literal, TypeVar
 
 from cosim.api.scenarios import Source, load
 from cosim.measurement.certificate_time import CertificateTime, measured_certificate_time
-from cosim.measurement.loss_bursts import WINDOWS
 from cosim.measurement.measurement_outputs import measurement_document
-from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
 from cosim.measurement.network_section import write_network
 from cosim.measurement.run_trace import read_source
-from cosim.measurement.trace_sources import USUAL_PERIOD_NS, SourceOptions, probe_period_ns
-from noack.core.file_access import require_suffix
-from noack.core.number_checks import one_of
-from noack.impairments.burst_prediction import USUAL_PACKETS
-from noack.traces.packet_trace import find_trace
+from netem.core.file_access import require_suffix
+from netem.core.number_checks import one_of
+from netem.impairments.burst_prediction import USUAL_PACKETS
+from netem.measurement.loss_bursts import WINDOWS
+from netem.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
+from netem.measurement.trace_sources import USUAL_PERIOD_NS, SourceOptions, probe_period_ns
+from netem.traces.packet_trace import find_trace
 
 Number = TypeVar("Number", int, float)
 

@@ -35,8 +35,8 @@ from cosim.record.run_record import RecordedRun, RunRecord, load_run, no_such_lo
 from cosim.record.table_files import TableFile, arrow_table
 from cosim.simulation.virtual_time import simulate_run
 from cosim.studies.run_comparison import RunComparison, compare_runs
-from noack.core.errors import CallerError, ExitStatus
-from noack.core.number_format import as_html, as_text
+from netem.core.errors import CallerError, ExitStatus
+from netem.core.number_format import as_html, as_text
 from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.scenario import Scenario
 

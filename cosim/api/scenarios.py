@@ -16,13 +16,13 @@ from cosim.studies.new_loop import (
     DEFAULT_MANSD,
     HORIZON_DECAY,
 )
+from netem.core.number_format import to_digits
+from netem.core.settings_section import ReadTable, Table
 from noack.core.linear_systems import spectral_abscissa
-from noack.core.number_format import to_digits
 from noack.scenario.given_settings import given_settings, plain, plain_table
 from noack.scenario.matrix_files import controller_of, matrices_of, model_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed_with, load_with, network_of
-from noack.settings.section import ReadTable, Table
 
 Source = Scenario | str | PathLike[str] | ReadTable
 """A scenario; or the name of a shipped one, a file, or a table with a scenario file's content."""

@@ -13,7 +13,7 @@ from cosim.output import certificate_report
 from cosim.output.result_tables import ResultTable
 from cosim.output.result_tables import save_tables as save_result_tables
 from cosim.studies.campaign.campaign_report import campaign_tables
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 
 Result = Run | Certificates | MarginResult | MeanCost | CampaignResult
 

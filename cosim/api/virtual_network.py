@@ -11,15 +11,15 @@ from typing import Generic, NamedTuple, TypeVar
 from cosim.api.scenarios import Source, load
 from cosim.shipped_files import find_shipped
 from netem.channel import Channel, Departure
+from netem.core import toml_file
+from netem.core.errors import CallerError
+from netem.core.number_checks import one_of, whole_number
+from netem.core.packet_rows import NETEM_PACKET
+from netem.core.settings_section import LARGEST_SEED, ReadTable
 from netem.link_state import LinkState
-from noack.core.errors import CallerError
-from noack.core.number_checks import one_of, whole_number
-from noack.core.packet_rows import NETEM_PACKET
 from noack.machines.run_channel import link_name, require_stand_alone
 from noack.protocol.wire_format import Flow, datagram_bytes
-from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario
-from noack.settings.section import LARGEST_SEED, ReadTable
 
 Content = TypeVar("Content")
 

@@ -19,10 +19,10 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     # Ctrl-C would print a traceback from within these imports.
-    from noack.core.errors import NoackError
-    from noack.core.system_processes import QUICK_IMPORTS, exhausted_limit
-    from noack.runtime.command_line import report_failure, stoppable_until_exit
-    from noack.runtime.standard_streams import guard_streams
+    from netem.core.command_line import report_failure, stoppable_until_exit
+    from netem.core.errors import NoackError
+    from netem.core.standard_streams import guard_streams
+    from netem.core.system_processes import QUICK_IMPORTS, exhausted_limit
 
     gc.set_threshold(_NEW_OBJECTS)
     words = sys.argv[1:]

@@ -18,10 +18,10 @@ from typer.main import get_command_name, get_group
 
 from cosim.cli.options import PANELS, examples
 from cosim.live.monitoring.line_times import lines_of_command
-from noack.core.errors import CallerError, ExitStatus, NoackError, plain_mistake, printable, why
-from noack.core.extension_points import missing_extension, parts
-from noack.core.system_processes import exhausted_limit
-from noack.runtime.command_line import StopRequestError, report_failure, stop_requests_raised, why_not_written
+from netem.core.command_line import StopRequestError, report_failure, stop_requests_raised, why_not_written
+from netem.core.errors import CallerError, ExitStatus, NoackError, plain_mistake, printable, why
+from netem.core.extension_points import missing_extension, parts
+from netem.core.system_processes import exhausted_limit
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
@@ -128,10 +128,10 @@ class Program(TyperGroup):
 
 def _setting_hint(option: str, command: "Command | None") -> str:
     """Return what to set instead if the name of an unknown option is that of a scenario's key."""
+    from netem.core.toml_file import keys as keys_of
     from noack.scenario.runtime_parameters import SHORT
     from noack.scenario.scenario import Scenario
     from noack.scenario.symbols import SYMBOLS
-    from noack.scenario.toml_file import keys as keys_of
 
     if command is None or not any("--set" in parameter.opts for parameter in command.params):
         return ""

@@ -3,7 +3,7 @@
 from contextlib import suppress
 
 from cosim.analysis.mean_cost import weight_matrix
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import value_of

@@ -14,7 +14,7 @@ from cosim.live.coordination.remote_access import ListenSettings
 from cosim.live.monitoring.run_observers import RunLog, RunObserver, log_end
 from cosim.live.monitoring.run_terminal import RunTerminal
 from cosim.record.run_directory import RunEnding, how_to_complete
-from noack.core.errors import PeerError
+from netem.core.errors import PeerError
 from noack.protocol.roles import ROLES
 from noack.runtime.active_runs import active_runs
 from noack.scenario.resolution import ResolvedRun, resolve

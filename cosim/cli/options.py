@@ -16,7 +16,7 @@ from cosim.output.figures.figure_format import FigureFormat
 from cosim.output.requirement import Requirement
 from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE, require_folder, require_output
 from cosim.shipped_files import find_shipped, shipped_names
-from noack.runtime.command_line import LogFormat, log_format
+from netem.core.command_line import LogFormat, log_format
 
 if TYPE_CHECKING:
     from noack.scenario.scenario import Scenario
@@ -58,9 +58,9 @@ def complete_runs(incomplete: str) -> list[str]:
 
 def complete_settings(incomplete: str) -> list[str]:
     """Return matching keys for ``--set``, each with its =."""
+    from netem.core.toml_file import keys
     from noack.scenario.runtime_parameters import SHORT
     from noack.scenario.scenario import Scenario
-    from noack.scenario.toml_file import keys
 
     return _matching(incomplete, [f"{key}=" for key in (*SHORT, *keys(Scenario))])
 
@@ -114,7 +114,7 @@ def load_loop(
 
 def require_linux() -> None:
     """Raise CallerError where there are no live runs; what a live run imports may be missing there."""
-    from noack.core.core_library import require_live_runs
+    from netem.core.core_library import require_live_runs
 
     require_live_runs()
 

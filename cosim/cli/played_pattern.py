@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from cosim.api.runs import simulate
-from noack.core.number_format import duration
+from netem.core.number_format import duration
 from noack.scenario.scenario import Scenario
 
 LONGEST_S = 600.0

@@ -7,18 +7,18 @@ from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from noack.core.errors import ExitStatus
-from noack.runtime.command_line import print_to_stderr
+from netem.core.command_line import print_to_stderr
+from netem.core.errors import ExitStatus
 
 if TYPE_CHECKING:
     from cosim.output.document import Document
     from cosim.output.result_tables import ResultTable
-    from noack.runtime.console import SafeConsole
+    from netem.core.console import SafeConsole
 
 
 def console() -> "SafeConsole":
     """Return a console on standard output."""
-    from noack.runtime.console import SafeConsole  # a program that reads JSON waits for no rich
+    from netem.core.console import SafeConsole  # a program that reads JSON waits for no rich
 
     return SafeConsole()
 

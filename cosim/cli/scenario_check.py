@@ -13,7 +13,7 @@ from cosim.cli.printing import print_json
 from cosim.live.launcher import DEFAULT_START_S
 from cosim.output.run_document import assumption_table
 from cosim.output.terminal_writer import terminal_table
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.scenario.resolution import ResolvedRun, policy_of, resolve
 from noack.scenario.scenario import Scenario, loop_names
 from noack.scenario.scenario_file import dumps

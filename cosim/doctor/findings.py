@@ -11,7 +11,7 @@ from typing import NamedTuple
 from cosim.doctor.machine_measures import MachineFacts, RunRequirements
 from cosim.output.document import Block, Document, Sentence
 from cosim.output.result_tables import ResultTable, Tone
-from noack.core.number_format import byte_size, duration
+from netem.core.number_format import byte_size, duration
 
 LOOP_PROCESSES = 5
 """Processes of a run, the recorder included."""

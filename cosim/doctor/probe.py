@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.clock import NS_PER_S, RunClock
+from netem.core.clock import NS_PER_S, RunClock
+from netem.core.realtime_settings import realtime
 from noack.protocol.roles import LOOP_ROLES, Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Wire
 from noack.runtime.drivers.live_driver import LiveDriver
 from noack.runtime.drivers.real_time_loop import RecordSink, run_loop
-from noack.runtime.drivers.realtime_settings import realtime
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from plant_server.plant import plants_of

@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 
 from cosim.record.run_directory import LEAST_FREE_BYTES
-from noack.core.errors import MachineError
-from noack.core.number_format import byte_size
+from netem.core.errors import MachineError
+from netem.core.number_format import byte_size
 
 _COPIES_AT_END = 3
 """At the end of a run, spool, record and view exist together, each of about the same size."""

@@ -59,9 +59,9 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, resolved_run
 from cosim.record.spool_conversion import finish_record
-from noack.core.errors import CallerError, ExitStatus, MachineError
-from noack.core.file_access import remove_file, write_whole
-from noack.core.system_processes import cores
+from netem.core.errors import CallerError, ExitStatus, MachineError
+from netem.core.file_access import remove_file, write_whole
+from netem.core.system_processes import cores
 from noack.runtime.spool import SPOOL
 from noack.theory.certificates.conditions import NetworkConditions
 

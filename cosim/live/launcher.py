@@ -38,11 +38,11 @@ from cosim.record.run_directory import (
     write_environment,
 )
 from cosim.record.run_scenario import write_scenario
-from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
-from noack.core.file_access import remove_folder, write_whole
+from netem.core.command_line import Signals, StopRequestError, stop_reason
+from netem.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
+from netem.core.file_access import remove_folder, write_whole
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime.active_runs import registered_run, run_name
-from noack.runtime.command_line import Signals, StopRequestError, stop_reason
 from noack.runtime.end_reasons import HORIZON
 from noack.runtime.run_descriptor import RunAccess, RunDescriptor, descriptor_file, new_access, new_descriptor
 from noack.scenario.resolution import ResolvedRun, resolve_run

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from noack.core.system_processes import cores as usable_cores
+from netem.core.system_processes import cores as usable_cores
 
 _MOST_SLOWED = 20.0
 """Factor by which a loaded machine extends a limit at most."""

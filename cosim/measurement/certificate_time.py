@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from cosim.analysis.claims.observed_conditions import PacketLosses
 from cosim.analysis.claims.run_certificates import scheduled_certificates
-from cosim.measurement.loss_bursts import Outcomes, outcomes
-from cosim.measurement.network_measurement import NetworkMeasurement
+from netem.measurement.loss_bursts import Outcomes, outcomes
+from netem.measurement.network_measurement import NetworkMeasurement
+from netem.traces.packet_trace import PacketTrace
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import NetworkConditions, allowed_conditions, network_delay_ns
-from noack.traces.packet_trace import PacketTrace
 
 Times = NDArray[np.int64]
 DELAY, ORDER, START = "delay", " (out of order)", "start"

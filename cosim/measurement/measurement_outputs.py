@@ -9,9 +9,6 @@ import numpy as np
 
 from cosim.live.monitoring.progress import activity
 from cosim.measurement.certificate_time import CertificateTime, measured_certificate_time
-from cosim.measurement.interval_estimates import LEVEL, IntervalEstimate
-from cosim.measurement.loss_bursts import histogram, most_losses
-from cosim.measurement.network_measurement import NetworkMeasurement
 from cosim.measurement.network_section import Form, write_network
 from cosim.output.curves import DASHED
 from cosim.output.document import Document, Sentence, SentenceRole
@@ -21,10 +18,13 @@ from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.figures.palette import Colour
 from cosim.output.result_tables import KEY_VALUE, ResultTable
-from noack.core.errors import CallerError
-from noack.core.file_access import require_suffix
-from noack.core.number_format import NONE, duration, number, percent
-from noack.impairments.burst_prediction import chance_text
+from netem.core.errors import CallerError
+from netem.core.file_access import require_suffix
+from netem.core.number_format import NONE, duration, number, percent
+from netem.impairments.burst_prediction import chance_text
+from netem.measurement.interval_estimates import LEVEL, IntervalEstimate
+from netem.measurement.loss_bursts import histogram, most_losses
+from netem.measurement.network_measurement import NetworkMeasurement
 from noack.scenario.scenario import Scenario
 
 if TYPE_CHECKING:

@@ -6,17 +6,17 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from cosim.measurement.chain_fits import ChainFit
-from cosim.measurement.network_measurement import NetworkMeasurement
 from cosim.record.run_directory import require_output, write_output
-from noack.core.errors import printable
-from noack.core.file_access import require_suffix
-from noack.core.number_checks import one_of
-from noack.impairments.target_loss import read_files
-from noack.scenario import toml_file
+from netem.core import toml_file
+from netem.core.errors import printable
+from netem.core.file_access import require_suffix
+from netem.core.number_checks import one_of
+from netem.impairments.target_loss import read_files
+from netem.measurement.chain_fits import ChainFit
+from netem.measurement.network_measurement import NetworkMeasurement
+from netem.traces.packet_trace import LOST_NS, PacketTrace
 from noack.scenario.scenario_file import toml_text
 from noack.scenario.sections import NetworkSection
-from noack.traces.packet_trace import LOST_NS, PacketTrace
 
 Form = Literal["trace", "model"]
 _SAMPLES = 101
@@ -56,7 +56,7 @@ def write_network(measurement: NetworkMeasurement, path: Path, form: Form) -> li
 
 
 def trace_csv(trace: PacketTrace) -> str:
-    """Return a trace as CSV in ns; :func:`noack.traces.packet_trace.read_trace` reads the same."""
+    """Return a trace as CSV in ns; :func:`netem.traces.packet_trace.read_trace` reads the same."""
     columns = (trace.sequence.tolist(), trace.sent_ns.tolist(), trace.received_ns.tolist())
     rows = (
         f"{number},{sent},{'' if received == LOST_NS else received}\n"

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.measurement.trace_sources import FILE_OPTIONS, SourceOptions, read_files, refuse_unused
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.measurement.trace_sources import FILE_OPTIONS, SourceOptions, read_files, refuse_unused
+from netem.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 from noack.protocol.record_tables import CONTROLLER_DELIVERY
-from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 
 
 def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> PacketTrace:

@@ -17,8 +17,8 @@ from cosim.output.guarantee_sentence import although_lost, guarantee_sentence, i
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
 from cosim.simulation.sampled_loop import SampledLoop
-from noack.core.errors import CallerError
-from noack.core.number_format import at_least, at_most, duration_at_least, number
+from netem.core.errors import CallerError
+from netem.core.number_format import at_least, at_most, duration_at_least, number
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus, other_sign, paper_assumptions

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 from cosim.analysis.conformance.verdicts import EdgeKind, Failed
 from cosim.analysis.summary.summary_model import ConformancePart, FailurePart
-from noack.core.number_format import counted, duration, percent
+from netem.core.number_format import counted, duration, percent
 
 _READINGS = {
     "x": "the state is not the recorded one",

@@ -8,7 +8,7 @@ from cosim.output.run_tables import burst_row, interval_rows, lost_row, title_of
 from cosim.output.run_verdict import verdict_of_exact_run
 from cosim.simulation import continuous
 from cosim.simulation.continuous import ContinuousRun
-from noack.core.number_format import number
+from netem.core.number_format import number
 from noack.scenario.scenario import Scenario
 
 _EVENTS_SHOWN = 40

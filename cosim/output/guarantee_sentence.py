@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from cosim.analysis.certificates import Certificates, state_norm
-from noack.core.number_format import counted
+from netem.core.number_format import counted
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate

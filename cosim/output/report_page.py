@@ -46,9 +46,9 @@ from cosim.record.run_directory import (
     read_object,
 )
 from cosim.record.run_record import RecordedRun
-from noack.core.errors import CallerError
-from noack.core.file_access import write_whole
-from noack.core.number_format import seconds
+from netem.core.errors import CallerError
+from netem.core.file_access import write_whole
+from netem.core.number_format import seconds
 from noack.scenario.scenario import Scenario
 
 PROCESS_FIGURES = ("lateness", "latency", "clocks")

@@ -12,7 +12,7 @@ from cosim.output.requirement import Requirement
 from cosim.output.result_tables import Tone
 from cosim.output.run_verdict import guarantee_of, is_covered, state_of
 from cosim.simulation.continuous import ContinuousSummary
-from noack.core.errors import CallerError, NoackError
+from netem.core.errors import CallerError, NoackError
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from cosim.record.run_directory import require_folder, write_output
-from noack.core.number_format import NONE
+from netem.core.number_format import NONE
 
 KEY_VALUE = ("quantity", "value")
 """Headings of a table in which each row has its own unit."""

@@ -29,7 +29,7 @@ from cosim.output.run_tables import (
 )
 from cosim.output.run_verdict import remarks, verdict
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE, file_of_loop
-from noack.core.number_format import counted
+from netem.core.number_format import counted
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 
 _ASSUMPTION_TONES: dict[str, Tone] = {

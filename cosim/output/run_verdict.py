@@ -24,8 +24,8 @@ from cosim.output.document import Sentence, SentenceRole
 from cosim.output.result_tables import Tone
 from cosim.output.run_tables import changes_in, shares_network, state_norm
 from cosim.simulation.continuous import ContinuousSummary
-from noack.core.errors import ExitStatus
-from noack.core.number_format import counted, duration_at_least, number
+from netem.core.errors import ExitStatus
+from netem.core.number_format import counted, duration_at_least, number
 from noack.protocol.wire_format import Rejection
 from noack.runtime.counting_sockets import DROPPED_IN_FLOOD
 from noack.runtime.end_reasons import HORIZON

@@ -16,8 +16,8 @@ import numpy as np
 from cosim.record.rows import Rows
 from cosim.record.run_directory import ENVIRONMENT_FILE, PROCESSES_FILE, finished_run, read_object
 from cosim.record.run_record import RunRecord, load_run, resolved_run
-from noack.core.errors import CallerError, MachineError, NoackError, PeerError, why
-from noack.core.file_access import move, open_folder
+from netem.core.errors import CallerError, MachineError, NoackError, PeerError, why
+from netem.core.file_access import move, open_folder
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message

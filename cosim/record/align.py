@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from cosim.record.rows import concatenate_rows
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
+from netem.core.row_operations import all_entries, firsts_of_equal, largest_sizes, row_norms, set_rows
 from noack.core.references import ModelFlow
-from noack.core.row_operations import all_entries, firsts_of_equal, largest_sizes, row_norms, set_rows
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from cosim.record.align import align_tables
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
-from noack.core.packet_rows import Fate, effective
+from netem.core.clock import NS_PER_S
+from netem.core.packet_rows import Fate, effective
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, SENSOR_MEASUREMENT, entry_names
 from noack.scenario.scenario import Scenario
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.row_operations import firsts_of_equal
+from netem.core.row_operations import firsts_of_equal
 from noack.scenario.scenario import Scenario
 
 Reals = NDArray[np.float64]

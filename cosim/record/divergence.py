@@ -21,9 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netem.core.row_operations import all_entries, row_norms
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.references import Reference
-from noack.core.row_operations import all_entries, row_norms
 from noack.disturbances.step import StepDisturbance
 from noack.scenario.resolution import loop_of, policy_of
 from noack.scenario.scenario import Scenario

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from cosim.record.rows import Rows, Slice
 from cosim.record.run_directory import REPORTS_FILE, read_object
-from noack.core.errors import PeerError
-from noack.core.file_access import write_whole
+from netem.core.errors import PeerError
+from netem.core.file_access import write_whole
 from noack.protocol.record_tables import OWNER, network_tables
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message

@@ -11,8 +11,8 @@ from cosim.record.processes import joint_reports
 from cosim.record.rows import Rows, with_loop
 from cosim.record.run_directory import RECORD, REPORTS_FILE
 from cosim.record.run_record import NOTICES_FILE, Notice, RecordedRun
-from noack.core.file_access import PARTIAL, create_folder, new_file, remove_file, write_whole
-from noack.core.system_processes import cores
+from netem.core.file_access import PARTIAL, create_folder, new_file, remove_file, write_whole
+from netem.core.system_processes import cores
 from noack.protocol.record_tables import LOOP, is_of_network
 from noack.scenario.resolution import ResolvedRun
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.row_operations import firsts_of_equal
+from netem.core.row_operations import firsts_of_equal
 from noack.protocol.record_tables import LOOP, NETEM_SETTING, is_of_network, network_tables
 from noack.protocol.wire_format import HEADER_ROW, MAGIC, VERSIONS, Flow
 

@@ -21,10 +21,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
-from noack.core.file_access import create_folder, locked, open_growing, read_regular, write_link, write_whole
-from noack.core.json_text import parse_json
-from noack.core.system_processes import cores
+from netem.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
+from netem.core.file_access import create_folder, locked, open_growing, read_regular, write_link, write_whole
+from netem.core.json_text import parse_json
+from netem.core.system_processes import cores
 from noack.runtime.spool import SPOOL
 
 DEFAULT_RUNS = Path("runs")

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from cosim.record.rows import Rows, messages_in
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NEVER_NS, NS_PER_S
-from noack.core.errors import CallerError
-from noack.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, effective
+from netem.core.clock import NEVER_NS, NS_PER_S
+from netem.core.errors import CallerError
+from netem.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, effective
 from noack.core.references import ModelFlow, Reference, ReferenceInForce
 from noack.protocol.record_tables import CONTROLLER_SETTING, NO_SEQUENCE, OWNER, SETTINGS, direction_of
 from noack.protocol.roles import CHANGEABLE

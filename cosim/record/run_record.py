@@ -41,9 +41,9 @@ from cosim.record.run_directory import (
     require_run_directory,
 )
 from cosim.record.table_files import TableFile
+from netem.core.errors import CallerError, PeerError
+from netem.core.packet_rows import NETEM_RELEASE
 from noack.core.cached_method import cached_method
-from noack.core.errors import CallerError, PeerError
-from noack.core.packet_rows import NETEM_RELEASE
 from noack.protocol.record_tables import (
     LOOP,
     NO_SEQUENCE,

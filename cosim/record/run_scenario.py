@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from cosim.record.run_directory import SCENARIO_FILE
-from noack.core.file_access import copy_whole, create_folder, write_whole
+from netem.core.file_access import copy_whole, create_folder, write_whole
 from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario import Scenario, with_loop_tables
 from noack.scenario.scenario_file import dumps

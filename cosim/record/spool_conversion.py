@@ -19,8 +19,8 @@ from cosim.record.record_writing import record_folder, vector_names
 from cosim.record.rows import BATCH_ROWS, Rows, Segment, concatenate_rows
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import Notice, RecordedRun, load_run, read_notices, resolved_run
-from noack.core.errors import MachineError, PeerError, why
-from noack.core.file_access import move, remove_folder
+from netem.core.errors import MachineError, PeerError, why
+from netem.core.file_access import move, remove_folder
 from noack.protocol.record_tables import LOOP, is_of_network
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message

@@ -17,8 +17,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosim.record.rows import BATCH_ROWS, Rows, Segment, concatenate_rows, parts_by_loop, with_columns
-from noack.core.errors import CallerError, one_line, why
-from noack.core.file_access import new_file
+from netem.core.errors import CallerError, one_line, why
+from netem.core.file_access import new_file
 from noack.protocol.record_tables import LOOP, OWNER, entry_names
 from noack.protocol.wire_format import MAX_LOOPS
 

@@ -26,12 +26,13 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from cosim.record.run_scenario import write_scenario
-from noack.core.clock import NEVER_NS, NS_PER_S
-from noack.core.core_library import CData, core, ffi, new_handle
-from noack.core.errors import ExitStatus, MachineError, why
-from noack.core.file_access import remove_folder
+from netem.core.clock import NEVER_NS, NS_PER_S
+from netem.core.core_library import CData, core, ffi, new_handle
+from netem.core.errors import ExitStatus, MachineError, why
+from netem.core.file_access import remove_folder
+from netem.core.settings_section import ReadTable
+from netem.core.system_processes import require_limits
 from noack.core.progress import Progress, no_progress
-from noack.core.system_processes import require_limits
 from noack.machines.loop_machines import LoopMachines, row_types
 from noack.machines.run_channel import RUN_ID, UserNetwork, channel_of
 from noack.protocol.record_tables import LOOP, OWNER, is_of_network, network_tables
@@ -41,7 +42,6 @@ from noack.runtime.end_reasons import HORIZON
 from noack.scenario.parameter_changes import change_notice, scheduled, settings_key
 from noack.scenario.resolution import ResolvedRun, resolve_run, shape_of, tables_of
 from noack.scenario.scenario import Scenario
-from noack.settings.section import ReadTable
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
 

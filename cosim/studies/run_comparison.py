@@ -30,10 +30,10 @@ from cosim.output.run_tables import caps_text
 from cosim.record.align import Reals, Times, align_tables
 from cosim.record.run_directory import chosen_run, require_output
 from cosim.record.run_record import RunRecord, load_record
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, shortened
-from noack.core.number_format import as_text
-from noack.core.row_operations import row_norms
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError, shortened
+from netem.core.number_format import as_text
+from netem.core.row_operations import row_norms
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ enum {
     NOACK_OPPORTUNITY_BYTES = 1504 /* that a delivery opportunity of mahimahi carries */
 };
 
-/* What becomes of a packet, as noack.core.packet_rows.Fate. */
+/* What becomes of a packet, as netem.core.packet_rows.Fate. */
 enum noack_fate {
     NOACK_DELIVERED,
     NOACK_DROPPED,

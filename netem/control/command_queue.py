@@ -13,13 +13,13 @@ from queue import SimpleQueue
 from threading import Lock
 from typing import NamedTuple, TypeVar
 
+from netem.core.errors import PeerError
+from netem.impairments.link_settings import Counters, LinkSettings
+from netem.impairments.markov_chain import NotPredictableError
+from netem.impairments.target_loss import expected_loss, loss_process
 from netem.relay.relay import Relay
 from netem.relay.relay_reports import DIRECTIONS, Direction, LinkReport
 from netem.tc_words import words_of
-from noack.core.errors import PeerError
-from noack.impairments.link_settings import Counters, LinkSettings
-from noack.impairments.markov_chain import NotPredictableError
-from noack.impairments.target_loss import expected_loss, loss_process
 
 T = TypeVar("T")
 
@@ -41,7 +41,7 @@ class AppliedSettings:
 
     @cached_property
     def predicted_loss(self) -> float | None:
-        """See :mod:`noack.impairments.loss_prediction`; this may take seconds."""
+        """See :mod:`netem.impairments.loss_prediction`; this may take seconds."""
         return expected_loss(self.settings).rate
 
     @cached_property

@@ -20,14 +20,14 @@ from zenoh.handlers import RingChannel
 from netem.control.command_queue import CommandQueue
 from netem.control.emulator_statistics import Statistics, StatisticsThread
 from netem.control.running_emulators import EMULATORS, registered_emulator
+from netem.control.zenoh_session import cause_of, open_session
+from netem.core.errors import CallerError, MachineError, NoackError
+from netem.core.json_text import parse_json
+from netem.core.toml_file import brief
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.target_loss import with_target_loss
 from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of, words_of
-from noack.core.errors import CallerError, MachineError, NoackError
-from noack.core.json_text import parse_json
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.target_loss import with_target_loss
-from noack.runtime.connections.zenoh_session import cause_of, open_session
-from noack.scenario.toml_file import brief
 
 _PUBLISH_S = 1.0
 """Time between two published statistics."""

@@ -18,13 +18,13 @@ from zenoh.handlers import RingChannel
 from netem.control.emulator_statistics import Statistics
 from netem.control.running_emulators import EMULATORS, find_emulator, running_emulators
 from netem.control.statistics_text import statistics_lines
+from netem.control.zenoh_session import answer_to, cause_of, open_session
+from netem.core.command_line import Parser, Signals, discard_output, report_failure
+from netem.core.errors import CallerError, ExitStatus, NoackError, PeerError, why
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.target_loss import read_files
 from netem.relay.relay_reports import DIRECTIONS
 from netem.tc_words import guarantee_words, require_no_dashes, settings_of
-from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError, why
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.target_loss import read_files
-from noack.runtime.command_line import Parser, Signals, discard_output, report_failure
-from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
 """Longest wait for the answer to a query."""

@@ -18,6 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.control.command_queue import AppliedSettings, CommandQueue, Snapshot
+from netem.core.address import address_text
+from netem.core.clock import NS_PER_S
+from netem.core.errors import PeerError
+from netem.core.packet_rows import Fate
+from netem.impairments.link_settings import Counters
 from netem.relay.relay_reports import (
     DIRECTIONS,
     Direction,
@@ -26,11 +31,6 @@ from netem.relay.relay_reports import (
     coarse_histogram,
     quantile_ns,
 )
-from noack.core.clock import NS_PER_S
-from noack.core.errors import PeerError
-from noack.core.packet_rows import Fate
-from noack.impairments.link_settings import Counters
-from noack.runtime.address import address_text
 
 _Z = 1.959963984540054
 """Quantile of the normal distribution for a 95 % interval."""
@@ -59,7 +59,7 @@ class LossStatistics(TypedDict):
     drawn_interval: list[float] | None
     """95 % interval of the rate that ``drawn`` measures, by the predicted correlation of the losses."""
     predicted: float | None
-    """Expected value of ``drawn``; see :mod:`noack.impairments.loss_prediction`."""
+    """Expected value of ``drawn``; see :mod:`netem.impairments.loss_prediction`."""
 
 
 class RecentRates(TypedDict):
@@ -89,7 +89,7 @@ class FlowStatistics(TypedDict):
 class DirectionStatistics(TypedDict):
     """One direction of a link; see :class:`netem.relay.relay_reports.DirectionReport`.
 
-    The counts are those of :class:`noack.impairments.link_settings.Counters`.
+    The counts are those of :class:`netem.impairments.link_settings.Counters`.
     """
 
     words: str

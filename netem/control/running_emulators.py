@@ -1,7 +1,7 @@
 """The files of running emulators, by which commands find them.
 
 While an emulator runs, its file is in the user's runtime directory
-(:mod:`noack.runtime.private_folder`), beside the Unix socket on which it listens, which only its
+(:mod:`netem.core.private_folder`), beside the Unix socket on which it listens, which only its
 user can reach.
 """
 
@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from noack.core.errors import CallerError, PeerError
-from noack.runtime import private_folder
-from noack.runtime.private_folder import require_name
+from netem.core import private_folder
+from netem.core.errors import CallerError, PeerError
+from netem.core.private_folder import require_name
 
 EMULATORS = "netem"
 """The folder of the files."""

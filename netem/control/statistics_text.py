@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 
 from netem.control.emulator_statistics import DirectionStatistics, LinkStatistics, Statistics
+from netem.core.number_format import counted, with_unit
 from netem.relay.relay_reports import DIRECTIONS
-from noack.core.number_format import counted, with_unit
 
 _NONE = "–"
 _BIT_RATES = ("Gbit/s", "Mbit/s", "kbit/s", "bit/s")

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from netem.core.address import packed_name
+from netem.core.core_library import CData, core
+from netem.core.udp_sockets import drops_of
 from netem.relay.link_sockets import Endpoint, has_data, return_path, stamp_arrivals
 from netem.relay.loss_warnings import LinkWarnings
 from netem.relay.relay_links import DeviceLink, OpenLink
 from netem.relay.relay_memory import RelayDirection, RelayMemory
-from noack.core.core_library import CData, core
-from noack.runtime.address import packed_name
-from noack.runtime.udp_sockets import drops_of
 
 _QUERIED_AT_ONCE = 64
 """Return paths whose drop counters are queried in one turn of housekeeping."""

@@ -8,9 +8,9 @@ import sys
 from contextlib import ExitStack, suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
 
-from noack.core.errors import CallerError
-from noack.runtime.address import Address, SocketName, address_of
-from noack.runtime.udp_sockets import bind_to, enlarge_buffer
+from netem.core.address import Address, SocketName, address_of
+from netem.core.errors import CallerError
+from netem.core.udp_sockets import bind_to, enlarge_buffer
 
 _BUFFER_BYTES = 4 * 1024 * 1024
 """Send buffer of a socket."""
@@ -98,7 +98,7 @@ def one_way_path(server: SocketName) -> Endpoint:
     """Return the sending socket of a link without a reverse direction.
 
     It receives nothing: the kernel drops answers at once; they are counted by
-    :func:`noack.runtime.udp_sockets.drops_of`.
+    :func:`netem.core.udp_sockets.drops_of`.
 
     Raises:
         OSError: there is no file descriptor left.

@@ -8,10 +8,10 @@ import os
 from collections import Counter
 from collections.abc import Mapping
 
+from netem.core.address import address_text
+from netem.core.number_format import counted
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import Direction, report_line
-from noack.core.number_format import counted
-from noack.runtime.address import address_text
 
 KERNEL = "lost_in_kernel"
 _CAUSES = {

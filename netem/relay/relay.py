@@ -7,16 +7,16 @@ from contextlib import suppress
 
 import numpy as np
 
+from netem.core.address import Address
+from netem.core.core_library import core, ffi
+from netem.core.errors import CallerError
+from netem.impairments.link_settings import LinkSettings
 from netem.relay.client_table import ClientTable
 from netem.relay.link_sockets import set_receive_timeout, stamp_arrivals
 from netem.relay.loss_warnings import LinkWarnings, UnintendedLosses
 from netem.relay.relay_links import DeviceLink, LinkSpec, OpenLink, open_links
 from netem.relay.relay_memory import RelayDirection, RelayMemory
 from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport
-from noack.core.core_library import core, ffi
-from noack.core.errors import CallerError
-from noack.impairments.link_settings import LinkSettings
-from noack.runtime.address import Address
 
 _PERIOD_NS = 40_000_000
 """Time between two turns of housekeeping."""

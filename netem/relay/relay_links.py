@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
+from netem.core.address import Address, SocketName, address_of, address_text, unpacked_address
+from netem.core.errors import CallerError
+from netem.core.udp_sockets import drops_of
+from netem.impairments.link_settings import LinkSettings
 from netem.relay.link_sockets import Endpoint, leads_to, listen, one_way_path, socket_name
 from netem.relay.relay_reports import DIRECTIONS, Direction, report_line
-from noack.core.errors import CallerError
-from noack.impairments.link_settings import LinkSettings
-from noack.runtime.address import Address, SocketName, address_of, address_text, unpacked_address
-from noack.runtime.udp_sockets import drops_of
 
 _DROPPED = 11
 """Column of /proc/net/dev with the packets that a full device did not take."""

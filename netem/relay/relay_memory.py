@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from netem.core.address import NAME_BYTES, SocketName, packed_name
+from netem.core.core_library import CData, StructRows, core, ffi, new_handle, pointer_to, rows_at
+from netem.impairments.link_settings import LinkSettings
 from netem.link_state import Integers, LinkState
 from netem.relay.relay_reports import Bytes
-from noack.core.core_library import CData, StructRows, core, ffi, new_handle, pointer_to, rows_at
-from noack.impairments.link_settings import LinkSettings
-from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
 _ROWS = 16
 """Flows of a direction for which there is room at first."""

@@ -10,9 +10,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.impairments.link_settings import Counters, LinkSettings
-from noack.runtime.address import Address
-from noack.runtime.command_line import print_to_stderr
+from netem.core.address import Address
+from netem.core.command_line import print_to_stderr
+from netem.impairments.link_settings import Counters, LinkSettings
 
 Bytes = NDArray[np.uint8]
 Direction = Literal["forward", "reverse"]

@@ -22,10 +22,10 @@ from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address
 from pathlib import Path
 from typing import NoReturn
 
+from netem.core.errors import CallerError, MachineError, why
+from netem.core.system_processes import exhausted_limit, python_command
 from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.shell import process
-from noack.core.errors import CallerError, MachineError, why
-from noack.core.system_processes import exhausted_limit, python_command
 
 MTU_BYTES = 1500
 _RANGE = IPv4Network("198.18.0.0/16")

@@ -12,15 +12,15 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
+from netem.core.command_line import Signals, log_format
+from netem.core.errors import CallerError, ExitStatus
+from netem.core.system_processes import python_command
 from netem.emulator_options import parse_options, shell_parser, shell_spec
 from netem.relay.relay_links import DeviceLink
 from netem.relay.relay_reports import report_line
 from netem.shell import process
 from netem.shell.devices import inside, open_devices
 from netem.stand_alone import add_relay_options, check_options, report_totals, run_relay
-from noack.core.errors import CallerError, ExitStatus
-from noack.core.system_processes import python_command
-from noack.runtime.command_line import Signals, log_format
 
 _ENDS_S = 10.0
 """More than the time that a guard gives the processes of its command to end."""

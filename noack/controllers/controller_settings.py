@@ -5,11 +5,11 @@ from typing import Annotated, ClassVar, Literal, NamedTuple, Protocol
 
 from pydantic import Field, FiniteFloat
 
-from noack.core.errors import NoackError
+from netem.core.errors import NoackError
+from netem.core.settings_section import ScenarioSection
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.references import AnyPiece
-from noack.settings.section import ScenarioSection
 from noack.settings.values import RateHz, Row
 
 MOST_PIECES = 10_000

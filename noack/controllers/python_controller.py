@@ -9,8 +9,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from netem.core.errors import CallerError
 from noack.controllers.controller_settings import ControlFailedError, ControllerSettings, ControlModel
-from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.settings.user_files import ClassSettings, new_instance, read_only, real_vector, user_code
 

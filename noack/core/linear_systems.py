@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import SCRATCH_MATRICES, CData, core, ffi, pointer_to
+from netem.core.core_library import SCRATCH_MATRICES, CData, core, ffi, pointer_to
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]

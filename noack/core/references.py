@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import CData, core, new_handle, new_structure, pointer_to
+from netem.core.core_library import CData, core, new_handle, new_structure, pointer_to
 from noack.core.linear_systems import Matrix, Propagator, Vector
 
 

@@ -10,9 +10,9 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
+from netem.core.periods import Period
+from netem.core.settings_section import ScenarioSection, Table
 from noack.core.linear_systems import Matrix, Vector
-from noack.core.periods import Period
-from noack.settings.section import ScenarioSection, Table
 from noack.settings.values import Row
 
 Place = Literal["input", "state"]

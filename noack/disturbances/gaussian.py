@@ -4,8 +4,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from netem.core.random_streams import normals
 from noack.core.linear_systems import Matrix, Vector
-from noack.core.random_streams import normals
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
 from noack.settings.values import Deviations
 

@@ -5,9 +5,9 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import FiniteFloat
 
+from netem.core.settings_section import Positive
 from noack.core.linear_systems import Matrix
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.section import Positive
 from noack.settings.values import Row
 
 

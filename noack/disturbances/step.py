@@ -5,10 +5,10 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
+from netem.core.settings_section import NonNegative
 from noack.core.linear_systems import Matrix
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.section import NonNegative
 from noack.settings.values import Row
 
 

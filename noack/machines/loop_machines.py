@@ -20,8 +20,8 @@ from weakref import proxy
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.clock import NEVER_NS
-from noack.core.core_library import (
+from netem.core.clock import NEVER_NS
+from netem.core.core_library import (
     CData,
     Reals,
     StructRows,
@@ -33,7 +33,7 @@ from noack.core.core_library import (
     rows_at,
     set_fields,
 )
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.roles import External, Notice, Record
 from noack.protocol.wire_format import Flow

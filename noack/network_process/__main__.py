@@ -3,18 +3,18 @@
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.command_line import stoppable_imports
+from netem.core.command_line import stoppable_imports
 
 with stoppable_imports():
     from netem.__main__ import COMMANDS
     from netem.__main__ import main as run_emulator
-    from noack.core.errors import CallerError, ExitStatus, NoackError
+    from netem.core.command_line import Parser, report_failure
+    from netem.core.errors import CallerError, ExitStatus, NoackError
+    from netem.core.standard_streams import guard_streams
     from noack.network_process.run_network import NetworkSockets, RunNetwork
     from noack.protocol.roles import ENDS
-    from noack.runtime.command_line import Parser, report_failure
     from noack.runtime.join_run import RUN_OPTIONS, add_options, add_run_options, join_run
     from noack.runtime.run_process import RunProcess
-    from noack.runtime.standard_streams import guard_streams
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -9,19 +9,19 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from netem.core.address import Address, SocketName, packed_name
+from netem.core.clock import RunClock
+from netem.core.core_library import StructRows, core
+from netem.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, PACKET_ROW
+from netem.core.udp_sockets import MAX_UDP_BYTES
+from netem.impairments.link_settings import LinkSettings
 from netem.relay.link_sockets import set_receive_timeout, stamp_arrivals
 from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
-from noack.core.clock import RunClock
-from noack.core.core_library import StructRows, core
-from noack.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, PACKET_ROW
-from noack.impairments.link_settings import LinkSettings
 from noack.machines.run_channel import Datagram, announce_change, due_settings, link_name
 from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import loop_number
-from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.counting_sockets import CountingSockets, errors_by_text
 from noack.runtime.drivers.real_time_loop import RecordSink, RowSink
-from noack.runtime.udp_sockets import MAX_UDP_BYTES
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
 

@@ -11,10 +11,10 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from noack.core.core_library import CData, new_handle, new_structure
+from netem.core.core_library import CData, new_handle, new_structure
+from netem.core.settings_section import ScenarioSection, Table
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.pole_placement import place_poles
-from noack.settings.section import ScenarioSection, Table
 from noack.settings.values import Row, require_length
 
 _RANK_TOLERANCE = 1e-9

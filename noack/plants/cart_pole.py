@@ -2,9 +2,9 @@
 
 from typing import ClassVar, Literal
 
+from netem.core.settings_section import NonNegative, Positive
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import EquationSettings, PlantEquations, cos, sin
-from noack.settings.section import NonNegative, Positive
 
 
 class CartPoleSettings(EquationSettings):

@@ -15,9 +15,9 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from netem.core.settings_section import NonNegative, Positive
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.plant_settings import PlantSettings, PlantStart, SystemFailedError
-from noack.settings.section import NonNegative, Positive
 
 _MAX_CHANGES = 10_000
 """Largest number of changes of the friction's direction within a step."""

@@ -5,9 +5,9 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, FiniteFloat
 
+from netem.core.settings_section import Positive
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import EquationSettings, PlantEquations, at_least, sqrt
-from noack.settings.section import Positive
 
 Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 

@@ -18,10 +18,10 @@ from typing import Annotated, ClassVar, NamedTuple, Protocol
 import numpy as np
 from pydantic import Field
 
-from noack.core.errors import NoackError
+from netem.core.errors import NoackError
+from netem.core.settings_section import ScenarioSection, Table
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.section import ScenarioSection, Table
 
 Names = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(max_length=MAX_DIMENSION)]
 Derivative = Callable[[float, Vector, Vector], Sequence[float] | Vector]

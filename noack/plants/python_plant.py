@@ -13,7 +13,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import (
     Names,

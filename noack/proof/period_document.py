@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netem.guarantee.loss_guarantee import LossRule
 from noack.core.linear_systems import Matrix, Vector
-from noack.guarantee.loss_guarantee import LossRule
 from noack.proof.loop_document import FORMAT, NoDocumentError
 from noack.proof.numbers import as_written, quotient
 from noack.proof.period_times import NEVER, LoopTimes

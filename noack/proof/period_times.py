@@ -4,7 +4,7 @@ import math
 from fractions import Fraction
 from typing import NamedTuple
 
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.scenario.arrival_ties import LATENCY_NS
 
 NEVER = 10**60

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, PACKET_HEAD_BYTES, Fate
+from netem.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, PACKET_HEAD_BYTES, Fate
 from noack.protocol.wire_format import Flow
 
 PLANT_STEP = "plant_step"

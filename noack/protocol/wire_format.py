@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.core_library import CData, core, ffi
+from netem.core.core_library import CData, core, ffi
 from noack.core.linear_systems import Vector
 
 KEY_BYTES = 32

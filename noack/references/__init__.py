@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING
 
+from netem.core.settings_section import kinds_in, union_of
 from noack.references.piece_settings import PieceSettings
-from noack.settings.section import kinds_in, union_of
 
 if TYPE_CHECKING:
     AnyPiece = PieceSettings

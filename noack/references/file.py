@@ -8,13 +8,13 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from noack.core.clock import NS_PER_S
-from noack.core.errors import shortened
+from netem.core.clock import NS_PER_S
+from netem.core.errors import shortened
+from netem.core.named_file import NamedFile
+from netem.core.settings_section import Positive
 from noack.core.linear_systems import Matrix, transition
 from noack.core.references import ReferenceSegment
 from noack.references.piece_settings import PieceSettings, TimeS
-from noack.settings.named_file import NamedFile
-from noack.settings.section import Positive
 from noack.settings.values import Row, rows_of
 
 MOST_ROWS = 100_000

@@ -8,8 +8,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, FiniteFloat
 
+from netem.core.settings_section import ScenarioSection
 from noack.core.linear_systems import Vector
-from noack.settings.section import ScenarioSection
 
 TimeS = Annotated[FiniteFloat, Field(ge=0, le=1e7)]
 """A simulated time of a run."""

@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.core.references import ReferenceSegment
 from noack.references.piece_settings import PieceSettings, TimeS
 from noack.settings.values import MatrixRows, Row, rows_of

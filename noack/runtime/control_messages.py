@@ -10,10 +10,10 @@ from typing import Annotated, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, JsonValue, ValidationError
 from pydantic_core import to_json
 
-from noack.core.errors import PeerError
+from netem.core.errors import PeerError
+from netem.core.settings_section import Table
+from netem.core.toml_file import brief
 from noack.scenario.parameter_changes import ParameterChange
-from noack.scenario.toml_file import brief
-from noack.settings.section import Table
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Nanoseconds = Annotated[int, Field(ge=-(2**63), lt=2**63)]
@@ -75,7 +75,7 @@ class ChangeAnnouncement(ControlMessage):
     requested_ns: Nanoseconds  # simulated time of the request
     requested_at: str  # date and time of the request; or that the scenario contains the change
     target_losses: dict[str, FiniteFloat] = {}
-    """Probabilities for :func:`noack.impairments.target_loss.store_probabilities`."""
+    """Probabilities for :func:`netem.impairments.target_loss.store_probabilities`."""
 
     @property
     def change(self) -> ParameterChange:

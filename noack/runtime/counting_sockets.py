@@ -16,13 +16,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 
-from noack.core.errors import PeerError
-from noack.core.number_format import counted
+from netem.core.address import LOOPBACK, Address, SocketName, address_text, family_of
+from netem.core.errors import PeerError
+from netem.core.number_format import counted
+from netem.core.udp_sockets import bind_to, drops_of, enlarge_buffer
 from noack.protocol.roles import Notice
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES
-from noack.runtime.address import LOOPBACK, Address, SocketName, address_text, family_of
 from noack.runtime.drivers.real_time_loop import RecordSink
-from noack.runtime.udp_sockets import bind_to, drops_of, enlarge_buffer
 
 _UNKNOWN_BYTES = 128 * 1024
 """Receive buffer for datagrams from unknown sources; the kernel doubles it. It holds about 300

@@ -18,8 +18,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.clock import NS_PER_S
-from noack.core.errors import MachineError, PeerError
+from netem.core.clock import NS_PER_S
+from netem.core.errors import MachineError, PeerError
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_ACTUATION, SENSOR_MEASUREMENT
 from noack.protocol.roles import Notice
 from noack.runtime.control_messages import ClockError

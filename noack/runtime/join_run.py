@@ -17,10 +17,10 @@ from typing import TypeVar
 
 from setproctitle import setproctitle
 
-from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
-from noack.core.system_processes import exhausted_limit, require_limits
-from noack.runtime.address import address_text
-from noack.runtime.command_line import Parser, Signals, report_failure
+from netem.core.address import address_text
+from netem.core.command_line import Parser, Signals, report_failure
+from netem.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
+from netem.core.system_processes import exhausted_limit, require_limits
 from noack.runtime.connections.credentials import read_credentials
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.end_reasons import HORIZON

@@ -13,8 +13,8 @@ from typing import IO, Annotated
 
 from pydantic import Field
 
-from noack.core.errors import CallerError, MachineError, PeerError, why
-from noack.core.file_access import create_file, open_append, open_regular
+from netem.core.errors import CallerError, MachineError, PeerError, why
+from netem.core.file_access import create_file, open_append, open_regular
 from noack.runtime.control_messages import ControlMessage, Count, message_json, parse_message
 from noack.runtime.spool import KEPT_REPORT, NOTICES, notices_of
 from noack.runtime.telemetry import first_row

@@ -14,16 +14,16 @@ from typing import Annotated
 
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
-from noack.core.clock import clock_identity
-from noack.core.errors import CallerError
-from noack.impairments.target_loss import known_probabilities, store_probabilities
+from netem.core.address import LOOPBACK
+from netem.core.clock import clock_identity
+from netem.core.errors import CallerError
+from netem.core.private_folder import live_lock_files, lock_file, require_name
+from netem.core.settings_section import ScenarioSection, Seed
+from netem.core.toml_file import brief
+from netem.impairments.target_loss import known_probabilities, store_probabilities
 from noack.protocol.wire_format import KEY_BYTES
-from noack.runtime.address import LOOPBACK
 from noack.runtime.control_messages import SocketAddress
-from noack.runtime.private_folder import live_lock_files, lock_file, require_name
 from noack.scenario.scenario import Scenario
-from noack.scenario.toml_file import brief
-from noack.settings.section import ScenarioSection, Seed
 
 DEFAULT_SESSION = "default"
 DESCRIPTOR_ON_STDIN = "NOACK_DESCRIPTOR_ON_STDIN"

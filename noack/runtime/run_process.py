@@ -19,8 +19,12 @@ from itertools import chain, repeat
 from pathlib import Path
 from typing import Protocol
 
-from noack.core.clock import NS_PER_S, RunClock, clock_identity
-from noack.core.errors import CallerError, NoackError, PeerError, one_line
+from netem.core.address import Address
+from netem.core.clock import NS_PER_S, RunClock, clock_identity
+from netem.core.command_line import Signals, print_to_stderr
+from netem.core.errors import CallerError, NoackError, PeerError, one_line
+from netem.core.realtime_settings import realtime
+from netem.core.udp_sockets import enlarge_buffer
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import (
@@ -38,8 +42,6 @@ from noack.protocol.roles import (
 )
 from noack.protocol.wire_format import Flow, Wire
 from noack.runtime.active_runs import run_name
-from noack.runtime.address import Address
-from noack.runtime.command_line import Signals, print_to_stderr
 from noack.runtime.control_messages import (
     Admission,
     AdmissionRequest,
@@ -54,14 +56,12 @@ from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.counting_sockets import CountingSockets, bind
 from noack.runtime.drivers.live_driver import LiveDriver, LoopSockets
 from noack.runtime.drivers.real_time_loop import Driver, ProcessSockets, run_loop
-from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.end_reasons import HORIZON, LAUNCHER_GONE, LOST_AFTER_S
 from noack.runtime.host_clocks import RECEIVED, CausalityCheck, clock_error, realtime_offset_ns
 from noack.runtime.kept_rows import KeptFile, KeptHead
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.runtime.spool import SPOOL
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
-from noack.runtime.udp_sockets import enlarge_buffer
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario_checks import prepare_changes

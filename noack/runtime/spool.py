@@ -14,8 +14,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, BinaryIO, NamedTuple
 
-from noack.core.errors import MachineError, why
-from noack.core.file_access import create_folder, open_append
+from netem.core.errors import MachineError, why
+from netem.core.file_access import create_folder, open_append
 
 SPOOL = "spool"  # the spool's folder in the run directory
 KEPT_REPORT = "report"

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.errors import PeerError
+from netem.core.errors import PeerError
 from noack.protocol.record_tables import LOOP
 from noack.protocol.roles import Notice, Record
 from noack.runtime.control_messages import BatchHeader, MissingRows, PersistedAck, parse_message

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from fractions import Fraction
 from math import floor, gcd
 
-from noack.core.clock import NS_PER_S
-from noack.impairments.feature import Impairment
-from noack.impairments.kinds.delay import Delay
+from netem.core.clock import NS_PER_S
+from netem.impairments.feature import Impairment
+from netem.impairments.kinds.delay import Delay
 from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario import Scenario
 

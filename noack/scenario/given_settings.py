@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from noack.core.errors import CallerError
-from noack.settings.section import ReadTable, Table
+from netem.core.errors import CallerError
+from netem.core.settings_section import ReadTable, Table
 
 
 def given_settings(settings: ReadTable | None) -> list[tuple[str, object]]:

@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.core.settings_section import ReadTable
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.linear import NAMED_MODELS
 from noack.protocol.record_tables import entry_names
 from noack.scenario.sections import instability
-from noack.settings.section import ReadTable
 
 _HELD = 1e-9
 """A singular value below this share of the largest one is 0."""

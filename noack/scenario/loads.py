@@ -20,7 +20,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa, transition
 from noack.disturbances.disturbance_settings import DisturbanceSettings
 from noack.disturbances.step import StepDisturbance

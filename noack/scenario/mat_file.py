@@ -9,7 +9,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from noack.core.system_processes import python_command
+from netem.core.system_processes import python_command
 
 with suppress(ImportError):  # Windows has no such limits
     import resource

@@ -18,15 +18,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
-from noack.core.errors import CallerError, why
-from noack.core.file_access import new_file
+from netem.core.errors import CallerError, why
+from netem.core.file_access import new_file
+from netem.core.named_file import NamedFile
+from netem.core.settings_section import ReadTable
+from netem.core.toml_file import brief
 from noack.core.linear_systems import Matrix, real_logarithm
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.scenario.mat_file import arrays_of_mat
 from noack.scenario.sections import ModelSection, instability
-from noack.scenario.toml_file import brief
-from noack.settings.named_file import NamedFile
-from noack.settings.section import ReadTable
 from noack.settings.values import require_shape, rows_of
 
 Arrays = dict[str, NDArray[np.generic]]

@@ -7,7 +7,7 @@ its deviation is c (x - x_r).
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from noack.settings.section import Positive, ScenarioSection
+from netem.core.settings_section import Positive, ScenarioSection
 from noack.settings.values import Name, Row, Unit, require_length
 
 DISTANCE = "output "

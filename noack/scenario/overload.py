@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
-from noack.core.clock import NS_PER_S
-from noack.guarantee.loss_guarantee import WindowBound
-from noack.impairments.kinds.opportunities import Opportunities
-from noack.impairments.kinds.rate import Rate
-from noack.impairments.kinds.schedule import Schedule
+from netem.core.clock import NS_PER_S
+from netem.guarantee.loss_guarantee import WindowBound
+from netem.impairments.kinds.opportunities import Opportunities
+from netem.impairments.kinds.rate import Rate
+from netem.impairments.kinds.schedule import Schedule
 from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_sections
 from noack.scenario.scenario_checks import with_settings

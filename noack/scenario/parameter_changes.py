@@ -13,16 +13,16 @@ from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
 from typing import Generic, NamedTuple, TypeVar
 
-from noack.core.clock import NEVER_NS, NS_PER_S
-from noack.core.errors import CallerError
-from noack.core.json_text import parse_json
+from netem.core.clock import NEVER_NS, NS_PER_S
+from netem.core.errors import CallerError
+from netem.core.json_text import parse_json
+from netem.core.settings_section import ReadTable, Table
 from noack.protocol.record_tables import CHANGE_BYTES
 from noack.protocol.roles import Notice, Record
 from noack.scenario.runtime_parameters import CONSTRAINTS, LOSS, MANSD, SETPOINT, text_of, trigger_parameters
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_checks import with_settings
 from noack.scenario.sections import PlantSection
-from noack.settings.section import ReadTable, Table
 
 _shared_tables = attrgetter(*(Scenario.model_fields.keys() - {"name", "plant", "seeds"}))
 _shared_of_plant = attrgetter(*(PlantSection.model_fields.keys() - {"initial_state", "A", "B"}))

@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from netem.core.clock import NS_PER_S
 from noack.controllers.state_space import StateSpaceSettings
-from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.references import ReferenceSegment
 from noack.references.file import FilePiece

@@ -14,12 +14,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError
+from netem.core.random_streams import stream
+from netem.core.settings_section import ScenarioSection
 from noack.controllers.controller_settings import ControllerSettings
 from noack.core.cached_method import cached_method
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
-from noack.core.random_streams import stream
 from noack.core.references import Reference
 from noack.observers.observer_settings import unobservable_mode
 from noack.protocol.record_tables import (
@@ -53,7 +54,6 @@ from noack.scenario.scenario import (
 )
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.sections import AnyObserver, ModelSection, PlantSection
-from noack.settings.section import ScenarioSection
 from noack.settings.values import rows_of
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
 from noack.trigger_policies.trigger_rule import Policy, TriggerRule, require_rule

@@ -4,9 +4,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
+from netem.core.settings_section import FolderName, ScenarioSection, Seed, Table
 from noack.scenario.runtime_parameters import full_key
-from noack.settings.section import FolderName, ScenarioSection, Seed, Table
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 

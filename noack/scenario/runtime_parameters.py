@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping
 from types import NoneType
 from typing import get_args
 
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.core.settings_section import ReadTable, Table
+from netem.core.toml_file import nearest_key
 from noack.scenario.symbols import SYMBOLS
-from noack.scenario.toml_file import nearest_key
-from noack.settings.section import ReadTable, Table
 from noack.trigger_policies.policy_settings import PolicySettings
 
 LOSS, MANSD, SETPOINT = "network.loss", "network.mansd", "controller.setpoint"

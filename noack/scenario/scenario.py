@@ -17,13 +17,13 @@ import numpy as np
 from pydantic import ConfigDict, GetJsonSchemaHandler, ValidationError, create_model, model_validator
 from pydantic_core import CoreSchema
 
-from noack.core.random_streams import named_stream_keys
+from netem.core.random_streams import named_stream_keys
+from netem.core.settings_section import ReadTable, ScenarioSection, Table
+from netem.core.toml_file import explain
 from noack.scenario.run_sections import MOST_LOOPS, LoopSection, SeedsSection
 from noack.scenario.scenario_checks import check_changes, check_sections
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.symbols import ScenarioRoot
-from noack.scenario.toml_file import explain
-from noack.settings.section import ReadTable, ScenarioSection, Table
 
 
 class Scenario(ScenarioTables):

@@ -15,13 +15,15 @@ from typing import TypeVar
 import numpy as np
 from pydantic import ValidationError
 
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
+from netem.core.settings_section import ReadTable, ScenarioSection, Table
+from netem.core.toml_file import explain
+from netem.impairments.constraints import require_consistent
+from netem.impairments.link_settings import Constraints, Mansd, require_scores
+from netem.impairments.loss_models import Loss
+from netem.impairments.loss_models.trace import TraceLoss
+from netem.impairments.target_loss import number_of_target_loss, with_target_loss
 from noack.core.linear_systems import Matrix, Vector
-from noack.impairments.constraints import require_consistent
-from noack.impairments.link_settings import Constraints, Mansd, require_scores
-from noack.impairments.loss_models import Loss
-from noack.impairments.loss_models.trace import TraceLoss
-from noack.impairments.target_loss import number_of_target_loss, with_target_loss
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.scenario.controller_states import check_controller_states
 from noack.scenario.loads import check_loads, noise_with_loads
@@ -30,8 +32,6 @@ from noack.scenario.runtime_parameters import LOSS, put_settings, require_runtim
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.sections import AnyController, AnyTrigger, NetworkSection
 from noack.scenario.symbols import ScenarioRoot
-from noack.scenario.toml_file import explain
-from noack.settings.section import ReadTable, ScenarioSection, Table
 from noack.settings.values import require_length, require_shape
 
 S = TypeVar("S", bound=ScenarioTables)

@@ -15,10 +15,14 @@ from pathlib import Path
 
 import tomli_w
 
-from noack.core.errors import CallerError, did_you_mean, printable, shortened
-from noack.core.file_access import shipped_files
+from netem.core import toml_file
+from netem.core.errors import CallerError, did_you_mean, printable, shortened
+from netem.core.file_access import shipped_files
+from netem.core.named_file import NamedFile
+from netem.core.settings_section import ReadTable, ScenarioSection, Table
+from netem.core.toml_file import keys as known_keys
+from netem.core.toml_file import nearest_key
 from noack.references.file import FilePiece
-from noack.scenario import toml_file
 from noack.scenario.integrals import with_integrals
 from noack.scenario.matrix_files import with_matrices
 from noack.scenario.overload import refuse_overload
@@ -27,10 +31,6 @@ from noack.scenario.scenario import LOOP_NEEDS, PARTS, Scenario, parts_model, wi
 from noack.scenario.scenario_checks import check_reference, check_target_loss
 from noack.scenario.sections import DirectionSection, NetworkSection
 from noack.scenario.symbols import SYMBOLS
-from noack.scenario.toml_file import keys as known_keys
-from noack.scenario.toml_file import nearest_key
-from noack.settings.named_file import NamedFile
-from noack.settings.section import ReadTable, ScenarioSection, Table
 from noack.settings.user_files import file_tables, with_absolute_path, with_tables
 from noack_check.files import MOST_LEVELS
 

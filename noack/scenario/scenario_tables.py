@@ -10,11 +10,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, FiniteFloat
 
+from netem.core.clock import NEVER_NS, NS_PER_S
+from netem.core.errors import CallerError
+from netem.core.number_format import as_html, as_text
+from netem.core.periods import Period, exact_ns, period_of, simplest_fraction
+from netem.core.settings_section import FolderName, ScenarioSection
 from noack.controllers.linear_feedback import LinearFeedbackSettings
-from noack.core.clock import NEVER_NS, NS_PER_S
-from noack.core.errors import CallerError
-from noack.core.number_format import as_html, as_text
-from noack.core.periods import Period, exact_ns, period_of, simplest_fraction
 from noack.plants.linear import LinearSettings
 from noack.protocol.roles import PROTOCOLS, LoopProtocol
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
@@ -37,7 +38,6 @@ from noack.scenario.sections import (
     PlantSection,
 )
 from noack.scenario.symbols import ScenarioRoot
-from noack.settings.section import FolderName, ScenarioSection
 from noack.trigger_policies.decaying import DecayingSettings
 
 MOST_CHANGES = 256  # largest number of scheduled changes in a run
@@ -206,7 +206,7 @@ class Timing:
     """The schedule of a loop: periods, phases and timeouts, in nanoseconds of simulated time.
 
     Machines use whole nanoseconds (``..._ns``). Theory needs the exact times where a period is none
-    (``exact_...``, and a period's :attr:`~noack.core.periods.Period.exact`): 10⁹/30 ns of 30 Hz.
+    (``exact_...``, and a period's :attr:`~netem.core.periods.Period.exact`): 10⁹/30 ns of 30 Hz.
     """
 
     scenario: ScenarioTables

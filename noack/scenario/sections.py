@@ -1,7 +1,7 @@
 """The tables of a scenario that describe one loop: model, plant and network.
 
 The kinds of controllers, disturbances, observers, plants and triggers are those that their folders
-and installed extensions have (:func:`noack.settings.section.kinds_in`).
+and installed extensions have (:func:`netem.core.settings_section.kinds_in`).
 """
 
 from collections.abc import Mapping
@@ -10,15 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.controllers.controller_settings import ControllerSettings
-from noack.core.cached_method import cached_method
-from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
-from noack.guarantee.loss_guarantee import LossGuarantee
-from noack.impairments.constraints import join_guarantee, require_consistent
-from noack.impairments.kinds import AnyImpairment
-from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import (
+from netem.core.settings_section import NonNegative, ScenarioSection, kinds_in, union_of
+from netem.guarantee.loss_guarantee import LossGuarantee
+from netem.impairments.constraints import join_guarantee, require_consistent
+from netem.impairments.kinds import AnyImpairment
+from netem.impairments.kinds.loss import LossOf
+from netem.impairments.link_settings import (
     USUAL_LIMIT,
     Constraints,
     LinkSettings,
@@ -26,15 +23,18 @@ from noack.impairments.link_settings import (
     require_order,
     require_scores,
 )
-from noack.impairments.loss_models import Loss
-from noack.impairments.loss_models.lossless import NoLoss
+from netem.impairments.loss_models import Loss
+from netem.impairments.loss_models.lossless import NoLoss
+from noack.controllers.controller_settings import ControllerSettings
+from noack.core.cached_method import cached_method
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
 from noack.observers.observer_settings import NoiseVariances, ObserverSettings
 from noack.plants.linear import NAMED_MODELS, LinearSettings, NamedModel, parameters_of
 from noack.plants.plant_settings import PlantSettings, name_and_unit, plain_name
 from noack.protocol.record_tables import entry_names
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
 from noack.scenario.symbols import ScenarioRoot
-from noack.settings.section import NonNegative, ScenarioSection, kinds_in, union_of
 from noack.settings.values import (
     Bounds,
     Deviations,

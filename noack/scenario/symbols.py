@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
-from noack.settings.section import ScenarioSection
+from netem.core.settings_section import ScenarioSection
 
 SYMBOLS = {
     "M": "M is network.mansd + 1; set network.mansd",

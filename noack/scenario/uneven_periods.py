@@ -4,8 +4,8 @@ Measurements are at steps of the plant, events at measurements, and inputs take 
 ``noack check`` says these lines, and so does every run.
 """
 
-from noack.core.clock import NS_PER_S
-from noack.core.periods import exact_ns
+from netem.core.clock import NS_PER_S
+from netem.core.periods import exact_ns
 from noack.scenario.scenario import Scenario
 
 

@@ -20,10 +20,10 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
-from noack.core.errors import NoackError, one_line
+from netem.core.errors import NoackError, one_line
+from netem.core.named_file import NamedFile
+from netem.core.settings_section import ScenarioSection
 from noack.core.linear_systems import Vector
-from noack.settings.named_file import NamedFile
-from noack.settings.section import ScenarioSection
 from noack.settings.values import MatrixRows, Row
 
 UserCode = Any

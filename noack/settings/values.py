@@ -8,9 +8,9 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, FiniteFloat
 
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
+from netem.core.periods import RATE_ROUNDING, period_of
 from noack.core.linear_systems import Matrix
-from noack.core.periods import RATE_ROUNDING, period_of
 from noack.protocol.wire_format import MAX_DIMENSION
 
 _LONGEST_NAME = 64

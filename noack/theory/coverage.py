@@ -5,8 +5,8 @@ What the statements of witnesses cover is in the checker's own table of keys.
 
 from collections.abc import Iterator
 
+from netem.core.errors import CallerError
 from noack.core.cached_method import cached_method
-from noack.core.errors import CallerError
 from noack.scenario.scenario import Scenario
 
 

@@ -47,6 +47,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from netem.core.row_operations import row_norms
 from noack.core.linear_systems import (
     Matrix,
     MatrixKey,
@@ -58,7 +59,6 @@ from noack.core.linear_systems import (
     spectral_abscissa,
     transition,
 )
-from noack.core.row_operations import row_norms
 from noack.scenario.resolution import LoopMatrices
 from noack.theory.response_bounds import NotDecayingError, bound_response
 from noack.trigger_policies.trigger_rule import Policy, TriggerRule

@@ -8,7 +8,7 @@ minimum inter-event time is positive by Theorem 2 for 0 < α < ᾱ; with ε > 0 
 
 from typing import ClassVar, Literal
 
-from noack.settings.section import NonNegative, Positive
+from netem.core.settings_section import NonNegative, Positive
 from noack.trigger_policies.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger_policies.trigger_rule import TriggerRule, error_form
 

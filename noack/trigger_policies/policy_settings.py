@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self, TypeAli
 import numpy as np
 from pydantic import Field, FiniteFloat, field_validator
 
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.core.periods import Period, exact_ns
+from netem.core.settings_section import ReadTable, ScenarioSection
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.core.periods import Period, exact_ns
-from noack.settings.section import ReadTable, ScenarioSection
 from noack.settings.values import MatrixRows, require_shape, rows_of
 from noack.trigger_policies.trigger_rule import Policy, TriggerRule, require_rule
 

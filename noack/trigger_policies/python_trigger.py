@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.settings.user_files import ClassSettings, UserCode, new_instance, read_only, user_code
 from noack.trigger_policies.policy_settings import ModelMatrices, WeightedSettings

@@ -10,9 +10,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from noack.core.clock import NS_PER_S
-from noack.core.periods import Period, exact_ns
-from noack.settings.section import NonNegative
+from netem.core.clock import NS_PER_S
+from netem.core.periods import Period, exact_ns
+from netem.core.settings_section import NonNegative
 from noack.settings.values import MatrixRows, require_shape
 from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger_policies.trigger_rule import TriggerRule, quadratic_form

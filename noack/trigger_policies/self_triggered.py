@@ -15,7 +15,7 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import model_validator
 
-from noack.settings.section import NonNegative, Positive
+from netem.core.settings_section import NonNegative, Positive
 from noack.trigger_policies.decaying import decaying_text
 from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger_policies.trigger_rule import Forecast, TriggerRule, no_form

@@ -21,8 +21,8 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import CData, core, new_handle, new_structure
-from noack.core.errors import CallerError
+from netem.core.core_library import CData, core, new_handle, new_structure
+from netem.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 
 

@@ -16,12 +16,12 @@ from typing import Any
 import psutil
 
 from cosim.record.run_record import RunRecord, load_record
-from noack.core.errors import ExitStatus
-from noack.core.packet_rows import NETEM_PACKET
+from netem.core.address import LOOPBACK
+from netem.core.errors import ExitStatus
+from netem.core.packet_rows import NETEM_PACKET
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_ACTUATION, SENSOR_MEASUREMENT
 from noack.protocol.roles import LOOP_ROLES, RECEIVES, sender_to
 from noack.protocol.wire_format import Flow, Rejection
-from noack.runtime.address import LOOPBACK
 from noack.runtime.counting_sockets import DROPPED_IN_FLOOD
 from noack.scenario.resolution import loop_of
 from tests.attacks.kinds import Plan, Sent, Target, carry_out

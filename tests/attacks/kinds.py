@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netem.core.address import LOOPBACK
 from noack.protocol.wire_format import HEADER_BYTES, KEY_BYTES, TAG_BYTES, Encoder, Flow, Message
-from noack.runtime.address import LOOPBACK
 from tests.helpers.two_hosts import enter_namespace
 
 FUTURE = 2**40

@@ -15,8 +15,8 @@ from rich.table import Table
 
 import noack
 from cosim.analysis.summary.summary_model import RunSummary
-from noack.runtime.console import SafeConsole
-from noack.runtime.standard_streams import guarded_stream, without_controls
+from netem.core.console import SafeConsole
+from netem.core.standard_streams import guarded_stream, without_controls
 
 ATTACK = "\x1b]0;title\x07\x1b[2J\x9b31m\r\x08\x7f\u202e"
 """Sets the title, clears the screen, colours, returns to the start of the line, reverses the text."""

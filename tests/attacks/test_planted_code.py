@@ -68,4 +68,4 @@ def test_only_one_function_starts_the_interpreter() -> None:
         for path in sorted((ROOT / package).rglob("*.py"))
         if re.search(r"\bsys\.executable\b", path.read_text())
     ]
-    assert naming == ["noack/core/system_processes.py"]
+    assert naming == ["netem/core/system_processes.py"]

@@ -19,8 +19,8 @@ from cosim.doctor.machine_measures import _runtime_folder_problem
 from cosim.output.viewer.loop_recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
 from netem.control import control_server as emulator_session
-from noack.core.errors import CallerError, MachineError, NoackError
-from noack.core.file_access import (
+from netem.core.errors import CallerError, MachineError, NoackError
+from netem.core.file_access import (
     create_file,
     create_folder,
     open_growing,
@@ -362,7 +362,7 @@ def test_statistics_pass_no_link_of_another_user(common: Path, private: Path) ->
 
 
 def test_standard_output_can_be_a_growing_file() -> None:
-    code = "import os, pathlib; from noack.core.file_access import open_growing;"
+    code = "import os, pathlib; from netem.core.file_access import open_growing;"
     code += "os.write(open_growing(pathlib.Path('/dev/stdout'), follow=True), b'text')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert (done.stdout, done.stderr) == (b"text", b"")

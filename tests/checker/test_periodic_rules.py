@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
-from noack.core.periods import period_of
+from netem.core.periods import period_of
 from noack.proof.statement_proof import prove_statement
 from noack_check.balls import matrix, number
 from noack_check.check import RejectedError

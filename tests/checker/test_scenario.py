@@ -10,7 +10,7 @@ import pytest
 from flint import arb, arb_mat, fmpq
 
 from cosim.analysis.witnesses import resolved_content
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import loop_of, resolve, rule_of
 from noack.scenario.scenario import Scenario

@@ -7,10 +7,10 @@ import pytest
 
 from cosim.analysis.mean_cost import find_mean_cost
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.guarantee.loss_guarantee import LongestBurst
+from netem.impairments.target_loss import loss_process
 from noack.core.linear_systems import Matrix
-from noack.guarantee.loss_guarantee import LongestBurst
-from noack.impairments.target_loss import loss_process
 from noack.proof.period_document import PeriodDocument
 from noack.proof.period_graph import PeriodGraph
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP

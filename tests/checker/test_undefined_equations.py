@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from cosim.analysis.witnesses import find_statement
 from cosim.cli.application import app
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 from noack.plants.systems.traced_equations import NotEnclosedError, trace
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load

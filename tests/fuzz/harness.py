@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from types import FrameType
 
-from noack.core.errors import NoackError
+from netem.core.errors import NoackError
 from tests.fuzz.edits import Choices
 
 FOLDER = Path(__file__).parent

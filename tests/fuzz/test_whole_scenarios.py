@@ -7,7 +7,7 @@ import pytest
 from flint import arb
 
 from cosim.simulation.virtual_time import simulate_run
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.scenario.scenario_file import load
 from noack_check.proof import Bound, Proof
 from tests.fuzz.scenarios import __main__ as command

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from noack.core.errors import NoackError
+from netem.core.errors import NoackError
 
 _OUTPUTS = Path(__file__).parents[1] / "cosim" / "output" / "approved"
 _STARTED = re.compile(r"started [\w:+-]+")

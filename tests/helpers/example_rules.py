@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 
+from netem.core.settings_section import Table
 from noack.core.linear_systems import Matrix
 from noack.scenario.sections import POLICIES
-from noack.settings.section import Table
 from noack.trigger_policies.mixed import mixed_rule as given_mixed_rule
 from noack.trigger_policies.policy_settings import ModelMatrices
 from noack.trigger_policies.trigger_rule import TriggerRule, error_form, quadratic_form, require_rule

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from noack.core.extension_points import NO_EXTENSIONS
+from netem.core.extension_points import NO_EXTENSIONS
 
 
 def install(folder: Path, name: str, entry_points: str, **modules: str) -> None:

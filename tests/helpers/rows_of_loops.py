@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
-from noack.core.packet_rows import NETEM_PACKET
+from netem.core.packet_rows import NETEM_PACKET
 from noack.protocol.record_tables import LOOP, OWNER, network_tables
 
 BATCH_NS = 100_000_000

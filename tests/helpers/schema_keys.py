@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 
+from netem.core.settings_section import Table
+from netem.core.toml_file import json_schema
 from noack.scenario.scenario import Scenario
-from noack.scenario.toml_file import json_schema
-from noack.settings.section import Table
 
 _SCHEMA = json_schema(Scenario)
 

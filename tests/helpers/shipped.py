@@ -1,10 +1,10 @@
 """The shipped scenarios, with settings as on the command line."""
 
 from cosim.shipped_files import find_shipped
+from netem.core.toml_file import read
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed_with, settings_of
-from noack.scenario.toml_file import read
 
 
 def shipped(name: str, *settings: str) -> Scenario:

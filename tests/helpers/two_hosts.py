@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from noack.core.errors import MachineError
+from netem.core.errors import MachineError
 
 _CLONE_NEWNET = 0x40000000
 

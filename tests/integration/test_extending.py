@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from noack.core.extension_points import NO_EXTENSIONS
+from netem.core.extension_points import NO_EXTENSIONS
 from tests.helpers.pages import blocks
 
 PAGE = "docs/extending.md"

@@ -16,7 +16,7 @@ import pytest
 
 from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
-from noack.core.errors import MachineError
+from netem.core.errors import MachineError
 from noack.protocol.roles import LOOP_ROLES, ROLES
 from tests.helpers import live_runs as live
 from tests.helpers.command_line import invoke

@@ -12,9 +12,9 @@ from contextlib import suppress
 
 import pytest
 
-from noack.core.errors import ExitStatus, MachineError
-from noack.runtime.address import address_text
-from noack.runtime.udp_sockets import enlarge_buffer
+from netem.core.address import address_text
+from netem.core.errors import ExitStatus, MachineError
+from netem.core.udp_sockets import enlarge_buffer
 from tests.attacks.attacked import unread_bytes
 from tests.helpers.emulators import Emulate
 from tests.helpers.two_hosts import TwoHosts, enter_namespace, two_hosts

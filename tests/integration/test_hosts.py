@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from cosim.record.run_record import load_record, load_run
-from noack.core.errors import MachineError
+from netem.core.errors import MachineError
 from noack.protocol.roles import LOOP_ROLES
 from tests.helpers import live_runs as live
 from tests.helpers.command_line import invoke

@@ -14,8 +14,8 @@ import pytest
 
 from netem.control import emulator_commands
 from netem.control.running_emulators import running_emulators
+from netem.core.errors import ExitStatus
 from netem.relay.relay import Relay
-from noack.core.errors import ExitStatus
 from tests.helpers.emulators import Emulate
 from tests.netem.relay.relays import HOSTS, endpoints, link, name_of
 

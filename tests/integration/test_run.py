@@ -23,8 +23,8 @@ from cosim.output.viewer import blueprint
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord, load_record
 from cosim.simulation.virtual_time import simulate
-from noack.core.clock import NS_PER_S
-from noack.core.packet_rows import NETEM_PACKET
+from netem.core.clock import NS_PER_S
+from netem.core.packet_rows import NETEM_PACKET
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,

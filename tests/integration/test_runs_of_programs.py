@@ -14,9 +14,9 @@ import pytest
 import noack
 from cosim.live.finalize import reopen
 from cosim.live.launcher import launch
-from noack.core.errors import CallerError, ExitStatus
-from noack.runtime import command_line
-from noack.runtime.command_line import StopRequestError
+from netem.core import command_line
+from netem.core.command_line import StopRequestError
+from netem.core.errors import CallerError, ExitStatus
 from tests.helpers.live_runs import WITHOUT_VIEWER
 
 pytestmark = pytest.mark.live

@@ -15,10 +15,10 @@ from typing import Any, NoReturn
 import pytest
 
 from netem.__main__ import main
+from netem.core.command_line import Signals
+from netem.impairments.link_settings import LinkSettings
 from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.shell import process, shell
-from noack.impairments.link_settings import LinkSettings
-from noack.runtime.command_line import Signals
 
 pytestmark = [pytest.mark.live, pytest.mark.system]
 

@@ -63,7 +63,7 @@ def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
         file.extractall(into)
     (sources,) = into.iterdir()
     for name in (LIBRARY, HEADER):
-        shutil.copyfile(INTO / name, sources / "noack" / "core" / name)
+        shutil.copyfile(INTO / name, sources / "netem" / "core" / name)
     built("--wheel", sources, "--out-dir", out)
     return out
 

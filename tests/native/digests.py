@@ -12,8 +12,8 @@ import numpy as np
 from cosim.shipped_files import find_shipped, shipped_names
 from cosim.simulation.exact_simulation import run_with_events
 from cosim.simulation.virtual_time import simulate
-from noack.core.core_library import core
-from noack.core.errors import CallerError
+from netem.core.core_library import core
+from netem.core.errors import CallerError
 from noack.core.linear_systems import exponential
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load

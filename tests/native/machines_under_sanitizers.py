@@ -10,9 +10,9 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from cosim.simulation.exact_simulation import ExactSimulation, run_with_events
-from noack.core import core_library
-from noack.core.core_library import core, load_core, new_handle, new_structure
-from noack.core.errors import CallerError
+from netem.core import core_library
+from netem.core.core_library import core, load_core, new_handle, new_structure
+from netem.core.errors import CallerError
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger_policies.trigger_rule import TriggerRule, new_rule
 from tests.cosim.simulation.exact_populations import random_population, random_setting

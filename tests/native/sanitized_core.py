@@ -53,9 +53,9 @@ def command(module: str, *arguments: str) -> tuple[list[str], Mapping[str, str]]
 def main() -> None:
     """Run a module with another core."""
     _, library, module, *arguments = sys.argv
-    from noack.core import core_library
+    from netem.core import core_library
 
-    assert not any(name.startswith(("netem", "noack.impairments")) for name in sys.modules)
+    assert not any(name.startswith(("netem", "netem.impairments")) for name in sys.modules)
     core_library.core = core_library.load_core(Path(library))
     sys.argv = [module, *arguments]
     runpy.run_module(module, run_name="__main__", alter_sys=True)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from native.build import HEADER, is_current
-from noack.core.core_library import LIBRARY, address_of, core, dtype_of, ffi, load_core, pointer_to
-from noack.core.errors import CallerError
-from noack.core.packet_rows import Fate
-from noack.impairments.feature import StageTables
-from noack.impairments.link_settings import Counters
-from tests.noack.impairments.feature_examples import IMPAIRED, names_file
+from netem.core.core_library import LIBRARY, address_of, core, dtype_of, ffi, load_core, pointer_to
+from netem.core.errors import CallerError
+from netem.core.packet_rows import Fate
+from netem.impairments.feature import StageTables
+from netem.impairments.link_settings import Counters
+from tests.netem.impairments.feature_examples import IMPAIRED, names_file
 
 ROOT = Path(__file__).parents[2]
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import ndtr, ndtri
 
-from noack.core.core_library import core, ffi
-from noack.core.random_streams import uniform_pair
+from netem.core.core_library import core, ffi
+from netem.core.random_streams import uniform_pair
 
 Function = Callable[[Decimal], Decimal]
 COUNT = 3000

@@ -2,7 +2,7 @@
 
 import pytest
 
-from noack.core.core_library import core, ffi
+from netem.core.core_library import core, ffi
 
 US, MS = 1_000, 1_000_000
 FAR, NEAR = 20 * MS, 400 * US

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Sequence
 
 from netem.channel import Channel
-from noack.core.clock import NEVER_NS
-from noack.core.core_library import core, ffi
-from noack.core.packet_rows import PACKET_HEAD_BYTES
+from netem.core.clock import NEVER_NS
+from netem.core.core_library import core, ffi
+from netem.core.packet_rows import PACKET_HEAD_BYTES
 from noack.machines.run_channel import Datagram, RunChannel
 from noack.protocol.roles import Notice, Record
 from noack.scenario.parameter_changes import ParameterChange

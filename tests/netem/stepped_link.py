@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+from netem.impairments.link_settings import Counters, LinkSettings
 from netem.link_state import LinkState
-from noack.impairments.link_settings import Counters, LinkSettings
 from noack.machines.run_channel import Datagram, RunChannel, UserNetwork
 from noack.protocol.roles import Notice, Record
 from tests.netem.stepped_channel import SteppedChannel

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as example_settings
 
+from netem.core.errors import CallerError
 from netem.explanation import tc_command
+from netem.impairments.kinds.loss import LossOf
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.loss_models.lossless import NoLoss
 from netem.tc_words import settings_of
-from noack.core.errors import CallerError
-from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.lossless import NoLoss
-from tests.noack.impairments.any_link_settings import settings as any_settings
+from tests.netem.impairments.any_link_settings import settings as any_settings
 
 _SHIM = """
 #include <sys/socket.h>

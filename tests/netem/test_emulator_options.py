@@ -11,9 +11,9 @@ import pytest
 from netem.__main__ import main
 from netem.emulator_options import command_line_parser as parser
 from netem.emulator_options import parse_options, specs_of
+from netem.impairments.kinds.loss import LOSS_WORDS
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import EXAMPLES, KEYWORDS, parse, settings_of
-from noack.impairments.kinds.loss import LOSS_WORDS
 from tests.helpers.approved import compare_lines
 
 ADDRESSES = "--listen :9000 --to :9001"

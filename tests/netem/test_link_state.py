@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from netem.core.core_library import core
+from netem.core.packet_rows import NETEM_PACKET, Fate
+from netem.impairments.kinds.opportunities import Opportunities
+from netem.impairments.link_settings import LinkSettings
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
-from noack.core.core_library import core
-from noack.core.packet_rows import NETEM_PACKET, Fate
-from noack.impairments.kinds.opportunities import Opportunities
-from noack.impairments.link_settings import LinkSettings
 from noack.machines.run_channel import Datagram, channel_of
 from noack.protocol.record_tables import tables
 from noack.protocol.roles import Notice, Record

@@ -9,13 +9,13 @@ import jsonschema
 import tomli_w
 from hypothesis import given
 
+from netem.core import toml_file
+from netem.impairments.link_settings import LinkSettings
 from netem.links_file import LinksFile, json_schema, load_links
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import settings_of
-from noack.impairments.link_settings import LinkSettings
-from noack.scenario import toml_file
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.noack.impairments.any_link_settings import settings
+from tests.netem.impairments.any_link_settings import settings
 
 ROOT = Path(__file__).parents[2]
 

@@ -15,10 +15,10 @@ import pytest
 
 import noack
 from netem import pytest_plugin
+from netem.core.errors import NoackError
 from netem.link_state import LinkState
 from netem.links_file import load_links
 from netem.tc_words import settings_of
-from noack.core.errors import NoackError
 from tests.helpers.pages import blocks
 from tests.helpers.waiting import wait_for
 

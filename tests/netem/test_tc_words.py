@@ -4,10 +4,10 @@ from pathlib import Path
 
 from hypothesis import assume, given
 
+from netem.impairments.link_settings import LinkSettings
 from netem.tc_words import parse, settings_of, words_of
-from noack.impairments.link_settings import LinkSettings
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.noack.impairments.any_link_settings import settings, words_can_say
+from tests.netem.impairments.any_link_settings import settings, words_can_say
 
 
 def test_words_are_the_approved_impairments() -> None:

@@ -8,13 +8,13 @@ stream comes from noack: numpy's SeedSequence.
 from collections import Counter
 from typing import Protocol
 
-from noack.core.packet_rows import Fate
-from noack.core.random_streams import stream_key
-from noack.impairments.kinds.duplicate import Duplicate
-from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from netem.core.packet_rows import Fate
+from netem.core.random_streams import stream_key
+from netem.impairments.kinds.duplicate import Duplicate
+from netem.impairments.kinds.loss import LossOf
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.loss_models.bernoulli import BernoulliLoss
+from netem.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from tests.oracles.loss_language import is_allowed
 
 _MASK = 2**32 - 1

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.impairments.constraints.at_most import AtMost
-from noack.impairments.constraints.recovery import Recovery
-from noack.impairments.link_settings import LinkSettings
+from netem.impairments.constraints.at_most import AtMost
+from netem.impairments.constraints.recovery import Recovery
+from netem.impairments.link_settings import LinkSettings
 
 
 def outcomes_of(decisions: NDArray[Any]) -> NDArray[np.bool_]:

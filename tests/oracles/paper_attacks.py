@@ -4,7 +4,7 @@ import numpy as np
 
 from cosim.analysis.adversary.pattern_search import likely_patterns
 from cosim.simulation.continuous import continuous_loop_of, simulate_continuous
-from noack.guarantee.loss_guarantee import LossAutomaton
+from netem.guarantee.loss_guarantee import LossAutomaton
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 

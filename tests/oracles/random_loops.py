@@ -7,8 +7,8 @@ from scipy.linalg import block_diag, solve_continuous_are
 
 from cosim.analysis.margin_search import read_guarantee
 from cosim.cli.options import find_scenario
+from netem.guarantee.loss_guarantee import LossGuarantee
 from noack.core.linear_systems import Matrix
-from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.theory.time_triggered.graph import Graph

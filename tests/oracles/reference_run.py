@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from noack.core.random_streams import normals, uniforms
+from netem.core.random_streams import normals, uniforms
 from noack.core.references import ReferenceSegment
 from noack.disturbances.disturbance_settings import SignalSource
 from noack.scenario.resolution import loop_of, reference_of

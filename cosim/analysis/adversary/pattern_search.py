@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from cosim.analysis.adversary.loop_flows import Flags, Pattern, SampledFlow, SegmentEnds
 from cosim.simulation.continuous import TooManyEventsError
 from cosim.simulation.exact_simulation import MAX_EVENTS
+from netem.core.row_operations import firsts_of_equal
+from netem.guarantee.loss_guarantee import LossAutomaton, LossGuarantee
 from noack.core.linear_systems import Matrix, Vector
-from noack.core.row_operations import firsts_of_equal
-from noack.guarantee.loss_guarantee import LossAutomaton, LossGuarantee
 
 Indices = NDArray[np.int64]
 SearchReport = Callable[[str, int, float], None]

@@ -28,7 +28,7 @@ from cosim.analysis.adversary.worst_run import WorstRun, reported_value
 from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.simulation.continuous import network_fates
 from cosim.simulation.sampled_loop import SampledLoop
-from noack.core.random_streams import stream
+from netem.core.random_streams import stream
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 

@@ -17,11 +17,11 @@ from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import network_fates
 from cosim.simulation.virtual_time import simulate
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
+from netem.core.random_streams import stream
+from netem.core.row_operations import row_norms
+from netem.guarantee.loss_guarantee import LossAutomaton
 from noack.core.linear_systems import Vector
-from noack.core.random_streams import stream
-from noack.core.row_operations import row_norms
-from noack.guarantee.loss_guarantee import LossAutomaton
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import network_delay_ns

@@ -4,7 +4,7 @@ import math
 from dataclasses import asdict, dataclass
 
 from cosim.analysis.adversary.loop_flows import Objective, Pattern
-from noack.guarantee.loss_guarantee import outcome_letters
+from netem.guarantee.loss_guarantee import outcome_letters
 
 BREACH = 1 + 1e-9
 """Share of the bound from which on a run refutes it; below are rounding errors."""

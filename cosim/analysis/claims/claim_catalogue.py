@@ -14,9 +14,9 @@ import numpy as np
 
 from cosim.analysis.claims.observed_conditions import Reals
 from cosim.analysis.claims.run_evidence import ROUNDING, ClaimEnd, RunEvidence, Samples, earliest
+from netem.core.number_format import at_most
+from netem.core.row_operations import row_norms
 from noack.core.linear_systems import Propagator
-from noack.core.number_format import at_most
-from noack.core.row_operations import row_norms
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import EQUATIONS

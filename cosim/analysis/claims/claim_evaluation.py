@@ -34,8 +34,8 @@ from cosim.record.decimation import decimate
 from cosim.record.divergence import largest_reference
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
-from noack.core.number_format import at_least, at_most
+from netem.core.clock import NS_PER_S
+from netem.core.number_format import at_least, at_most
 from noack.core.references import Reference
 from noack.scenario.loads import first_load_change_s
 from noack.scenario.resolution import loop_of

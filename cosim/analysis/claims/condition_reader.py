@@ -11,8 +11,8 @@ from cosim.analysis.claims.observed_conditions import ObservedConditions, Packet
 from cosim.analysis.conformance.input_origins import AppliedUpdate, SampledSeries, Times, plant_inputs
 from cosim.record.rows import messages_in
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
-from noack.core.packet_rows import NETEM_PACKET, effective
+from netem.core.clock import NS_PER_S
+from netem.core.packet_rows import NETEM_PACKET, effective
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.runtime.host_clocks import RECEIVED, allowed_lead_ns
 

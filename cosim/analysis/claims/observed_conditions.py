@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.conformance.input_origins import SampledSeries
-from noack.guarantee.loss_guarantee import LongestBurst, LossRule
+from netem.guarantee.loss_guarantee import LongestBurst, LossRule
 from noack.theory.certificates.conditions import NetworkConditions
 
 _TOLERANCE_S = 1e-9

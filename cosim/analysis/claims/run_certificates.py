@@ -9,11 +9,11 @@ from cosim.analysis.conformance.run_document import RunDocument, document_of_sta
 from cosim.analysis.loop_files import naming_of
 from cosim.analysis.scenario_certificates import certificate_of
 from cosim.analysis.witnesses import WitnessedStatement, find_statement, plants_of
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
+from netem.core.settings_section import Table
 from noack.proof.loop_document import NoDocumentError
 from noack.scenario.loads import with_constant_load
 from noack.scenario.scenario import Scenario
-from noack.settings.section import Table
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import NetworkConditions, allowed_conditions, certified_delay_s
 

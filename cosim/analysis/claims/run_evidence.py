@@ -25,9 +25,9 @@ from cosim.analysis.summary.summary_model import ClaimCause
 from cosim.record.align import AlignedRun, PlantStates, aligned_parts, bounded_parts
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NEVER_NS
-from noack.core.errors import CallerError
-from noack.core.row_operations import all_entries
+from netem.core.clock import NEVER_NS
+from netem.core.errors import CallerError
+from netem.core.row_operations import all_entries
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.runtime_parameters import SETPOINT

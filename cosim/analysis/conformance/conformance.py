@@ -29,7 +29,7 @@ from scipy.optimize import lsq_linear, nnls
 
 from cosim.analysis.conformance.trace import Flags, Numbers, Trace
 from cosim.analysis.conformance.verdicts import Conformance, Failed, Failure
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 
 STATE, MOTION, INPUT, FACT = 1e-7, 1e-6, 1e-6, 1e-9

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cosim.record.run_events import ActuationTimes
 from cosim.record.run_record import RunRecord
-from noack.core.row_operations import largest_sizes
+from netem.core.row_operations import largest_sizes
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,

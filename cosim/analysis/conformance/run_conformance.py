@@ -13,8 +13,8 @@ from cosim.analysis.conformance.verdicts import Conformance
 from cosim.analysis.loop_files import naming_of, widest
 from cosim.analysis.witnesses import WitnessedStatement, find_witnesses, plants_of
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError
 from noack.core.references import Reference
 from noack.proof.loop_document import NoDocumentError
 from noack.scenario.resolution import loop_of

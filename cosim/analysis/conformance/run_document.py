@@ -9,7 +9,7 @@ from flint import fmpq
 
 from cosim.analysis.conformance.verdicts import EdgeKind, Place, Transition
 from cosim.analysis.witnesses import WitnessedStatement
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.proof.files import document_of
 from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError

@@ -15,8 +15,8 @@ from cosim.analysis.conformance.input_origins import PlantInputs, plant_inputs
 from cosim.analysis.conformance.run_document import RunDocument
 from cosim.analysis.conformance.verdicts import EdgeKind, Place, Transition, Unknown
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError
 from noack.core.linear_systems import Propagator, Vector
 from noack.core.references import Reference
 from noack.protocol.record_tables import CONTROLLER_STEP, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT

@@ -29,7 +29,7 @@ from cosim.analysis.replay.replay_result import (
 )
 from cosim.record.rows import Rows, Slice
 from cosim.record.run_record import RecordedRun, RunRecord
-from noack.core.packet_rows import NETEM_PACKET
+from netem.core.packet_rows import NETEM_PACKET
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     PLANT_ACTUATION,

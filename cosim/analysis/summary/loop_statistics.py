@@ -23,9 +23,9 @@ from cosim.analysis.summary.summary_model import (
 )
 from cosim.record.run_events import ActuationTimes, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NEVER_NS, NS_PER_S
-from noack.core.packet_rows import Fate, effective
-from noack.guarantee.loss_guarantee import LongestBurst
+from netem.core.clock import NEVER_NS, NS_PER_S
+from netem.core.packet_rows import Fate, effective
+from netem.guarantee.loss_guarantee import LongestBurst
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,

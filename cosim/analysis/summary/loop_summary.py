@@ -23,11 +23,11 @@ from cosim.analysis.summary.summary_model import ChangePart, ExitPart, LoopSumma
 from cosim.record.divergence import Divergence, divergence
 from cosim.record.run_events import changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
-from noack.core.errors import ExitStatus
+from netem.core.clock import NS_PER_S
+from netem.core.errors import ExitStatus
+from netem.core.packet_rows import NETEM_PACKET, Fate, effective
+from netem.impairments.target_loss import expected_loss
 from noack.core.linear_systems import Vector
-from noack.core.packet_rows import NETEM_PACKET, Fate, effective
-from noack.impairments.target_loss import expected_loss
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_STEP, UPDATES
 from noack.protocol.roles import FAILED, LOOP_ROLES
 from noack.protocol.wire_format import Flow

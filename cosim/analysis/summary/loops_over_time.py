@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from cosim.analysis.summary.quantiles import quantiles_in
 from cosim.record.align import Reals, aligned_parts
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
-from noack.core.packet_rows import NETEM_PACKET
-from noack.core.row_operations import firsts_of_equal, row_norms
+from netem.core.packet_rows import NETEM_PACKET
+from netem.core.row_operations import firsts_of_equal, row_norms
 
 INTERVALS = 200
 """Intervals of equal width into which a run is divided."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from cosim.analysis.summary.summary_model import OutputPart
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.outputs import LoopOutput
 from noack.scenario.resolution import loop_of

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cosim.analysis.summary.summary_model import LinearisationPart, NoLinearisationPart
-from noack.core.errors import NoackError
+from netem.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.plant_settings import PlantStart, PlantSystem
 from noack.plants.systems.linearisation import NO_STATE, STEP_NS, linearise

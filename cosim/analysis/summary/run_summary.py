@@ -21,13 +21,13 @@ from cosim.analysis.summary.summary_model import (
     RunSummary,
 )
 from cosim.record.run_record import Rows, RunRecord, no_such_loop
-from noack.core.clock import NS_PER_S
-from noack.core.errors import ExitStatus
-from noack.core.number_format import number as number_text
-from noack.core.packet_rows import NETEM_PACKET, Fate
-from noack.impairments.feature import Impairment
-from noack.impairments.kinds.duplicate import Duplicate
-from noack.impairments.kinds.rate import Rate
+from netem.core.clock import NS_PER_S
+from netem.core.errors import ExitStatus
+from netem.core.number_format import number as number_text
+from netem.core.packet_rows import NETEM_PACKET, Fate
+from netem.impairments.feature import Impairment
+from netem.impairments.kinds.duplicate import Duplicate
+from netem.impairments.kinds.rate import Rate
 
 _BINS = 200
 """Intervals of the datagrams in flight."""

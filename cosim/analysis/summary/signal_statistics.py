@@ -15,7 +15,7 @@ from cosim.analysis.summary.summary_model import DisturbancePart, EstimationPart
 from cosim.record.align import AlignedPart, AlignedRun, Reals, bounded_parts, is_bounded
 from cosim.record.run_events import reference_in_run
 from cosim.record.run_record import RunRecord
-from noack.core.row_operations import row_norms
+from netem.core.row_operations import row_norms
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.estimation import steady_state
 from noack.scenario.scenario import Scenario

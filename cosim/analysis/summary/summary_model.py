@@ -16,8 +16,8 @@ from pydantic import (
 )
 
 from cosim.analysis.conformance.verdicts import Conformance, EdgeKind, Failed
-from noack.core.errors import CallerError, ExitStatus
-from noack.core.number_format import at_least, at_most
+from netem.core.errors import CallerError, ExitStatus
+from netem.core.number_format import at_least, at_most
 from noack.scenario.scenario import few_of
 
 

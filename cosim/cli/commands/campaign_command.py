@@ -12,7 +12,7 @@ from cosim.cli.options import CAMPAIGNS, examples
 from cosim.cli.printing import show, write_tables
 from cosim.output.figures.figure_format import requested_files
 from cosim.record.run_directory import DEFAULT_RUNS
-from noack.core.errors import CallerError, ExitStatus
+from netem.core.errors import CallerError, ExitStatus
 
 app = typer.Typer()
 

@@ -14,8 +14,8 @@ from cosim.cli.options import CAMPAIGNS, examples
 from cosim.cli.printing import show_written
 from cosim.output.figures.figure_format import requested_files
 from cosim.record.run_directory import DEFAULT_RUNS
-from noack.core.errors import CallerError, ExitStatus
-from noack.runtime.command_line import print_to_stderr
+from netem.core.command_line import print_to_stderr
+from netem.core.errors import CallerError, ExitStatus
 
 app = typer.Typer()
 
@@ -164,7 +164,7 @@ def design(
     from cosim.studies.design.design_outcome import design_for_network
     from cosim.studies.design.design_space import families_of
     from cosim.studies.design.network_search import DesignRequest
-    from noack.core.file_access import require_suffix
+    from netem.core.file_access import require_suffix
     from noack.scenario.scenario_file import dumps
 
     figure_files = requested_files(figure_format, width)

@@ -9,7 +9,7 @@ from cosim.cli import options as opt
 from cosim.cli.options import FILES, examples
 from cosim.cli.printing import show, status
 from cosim.record.run_directory import DEFAULT_RUNS
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 
 app = typer.Typer()
 

@@ -13,7 +13,7 @@ from cosim.cli import options as opt
 from cosim.cli.options import MEASURING, examples
 from cosim.cli.printing import show
 from cosim.output.figures.figure_format import requested_files
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 
 app = typer.Typer()
 
@@ -153,12 +153,12 @@ def measure(
 
     Takes some seconds.
     """
-    from cosim.measurement.loss_bursts import WINDOWS
     from cosim.measurement.measurement_outputs import OutputRequest, write_outputs
-    from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
     from cosim.measurement.run_trace import read_source
-    from cosim.measurement.trace_sources import SourceOptions
-    from noack.traces.packet_trace import find_trace
+    from netem.measurement.loss_bursts import WINDOWS
+    from netem.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
+    from netem.measurement.trace_sources import SourceOptions
+    from netem.traces.packet_trace import find_trace
 
     options = MeasurementOptions(
         _time_s("--deadline", deadline),
@@ -185,7 +185,7 @@ def measure(
 
 def _period_ns(rate: str) -> int:
     """Return the period of a rate such as ``50hz`` or ``2khz``."""
-    from cosim.measurement.trace_sources import probe_period_ns
+    from netem.measurement.trace_sources import probe_period_ns
 
     match = _RATE.fullmatch(rate)
     per_s = Decimal(match[1]) * (1000 if match[2] else 1) if match else Decimal(0)
@@ -196,7 +196,7 @@ def _period_ns(rate: str) -> int:
 
 def _time_s(option: str, text: str | None) -> float | None:
     """Return a time such as ``60s``."""
-    from noack.impairments.words import OWN_TIME_S
+    from netem.impairments.words import OWN_TIME_S
 
     if text is None:
         return None

@@ -10,7 +10,7 @@ from typer import Argument, Option
 from cosim.cli import options as opt
 from cosim.cli.options import FILES, examples
 from cosim.cli.printing import print_lines, status
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 
 app = typer.Typer()
 

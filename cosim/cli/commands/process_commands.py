@@ -10,8 +10,8 @@ from typer import Option
 from cosim.cli import options as opt
 from cosim.cli.options import PROCESSES, examples
 from cosim.record.run_directory import DEFAULT_RUNS
-from noack.core.errors import CallerError
-from noack.runtime.command_line import LogFormat
+from netem.core.command_line import LogFormat
+from netem.core.errors import CallerError
 
 app = typer.Typer()
 

@@ -10,7 +10,7 @@ from cosim.cli import options as opt
 from cosim.cli.options import RUNS, examples
 from cosim.cli.printing import console, print_json
 from cosim.record.run_directory import DEFAULT_RUNS
-from noack.runtime.command_line import LogFormat, print_to_stderr
+from netem.core.command_line import LogFormat, print_to_stderr
 
 app = typer.Typer()
 
@@ -116,7 +116,7 @@ def simulate(
     from cosim.cli.execute_run import finalize_run, simulate_continuously, warn_of_violations
     from cosim.live.monitoring.progress import error_console, simulation_bar
     from cosim.simulation.virtual_time import simulate_run
-    from noack.runtime.command_line import print_to_stderr
+    from netem.core.command_line import print_to_stderr
     from noack.scenario.arrival_ties import late_inputs, with_later_updates
 
     loaded = opt.load_scenario(scenario, settings, network)

@@ -19,8 +19,8 @@ from cosim.record.run_directory import (
     file_of_loop,
     is_run_directory,
 )
-from noack.core.errors import CallerError, ExitStatus, NoackError
-from noack.runtime.command_line import print_to_stderr
+from netem.core.command_line import print_to_stderr
+from netem.core.errors import CallerError, ExitStatus, NoackError
 
 app = typer.Typer()
 

@@ -132,7 +132,7 @@ def schema(
 
         print_json(links_schema())
     else:
+        from netem.core.toml_file import json_schema
         from noack.scenario.scenario import Scenario
-        from noack.scenario.toml_file import json_schema
 
         print_json(json_schema(Scenario))

@@ -12,8 +12,8 @@ from cosim.cli.options import THEORY, examples
 from cosim.cli.printing import show, status, status_of
 from cosim.output.requirement import Requirement
 from cosim.record.run_directory import DEFAULT_RUNS
-from noack.core.errors import CallerError, ExitStatus
-from noack.runtime.command_line import StopRequestError, print_to_stderr
+from netem.core.command_line import StopRequestError, print_to_stderr
+from netem.core.errors import CallerError, ExitStatus
 
 if TYPE_CHECKING:
     from noack.scenario.scenario import Scenario
@@ -117,7 +117,7 @@ def certify(
     from cosim.output.export.mat_export import save_mat
     from cosim.output.requirements import uncovered_as_unmet, unmet_by_scenario
     from cosim.record.run_directory import write_output
-    from noack.core.file_access import require_suffix
+    from netem.core.file_access import require_suffix
     from noack.scenario.resolution import resolve
     from noack.theory.witnesses.effort import MOST_WORK
 

@@ -5,9 +5,10 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from operator import itemgetter
 
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
-from noack.impairments.target_loss import known_probabilities
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError
+from netem.core.settings_section import ReadTable, Table
+from netem.impairments.target_loss import known_probabilities
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.control_plane import ControlPlane
 from noack.scenario.overload import refuse_overload
@@ -21,7 +22,6 @@ from noack.scenario.parameter_changes import (
 from noack.scenario.resolution import ResolvedRun, policy_of, resolve
 from noack.scenario.run_sections import ScheduledChange
 from noack.scenario.scenario_tables import MOST_CHANGES
-from noack.settings.section import ReadTable, Table
 from noack.trigger_policies.trigger_rule import TriggerRule
 
 _CHANGE_DELAY_S = 0.2

@@ -15,9 +15,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from noack.core.errors import CallerError
-from noack.core.file_access import create_folder, lock, locked, move, read_regular
-from noack.core.json_text import parse_json
+from netem.core.errors import CallerError
+from netem.core.file_access import create_folder, lock, locked, move, read_regular
+from netem.core.json_text import parse_json
 
 MARK = ".noack-credentials"
 _MOST_BYTES = 64 * 2**20

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cosim.live.coordination.credentials_folder import credentials_folder
-from noack.core.clock import clock_identity
-from noack.core.errors import CallerError, PeerError, why
+from netem.core.address import Address, address_text, parse_address
+from netem.core.clock import clock_identity
+from netem.core.errors import CallerError, PeerError, why
 from noack.protocol.roles import LOOP_ROLES, RECORDER
-from noack.runtime.address import Address, address_text, parse_address
 from noack.runtime.connections.credentials import CA_FILE, CERTIFICATE_FILE, KEY_FILE, RUN_FILE, own_host
 from noack.runtime.control_messages import ClockError
 from noack.runtime.host_clocks import clock_error, require_small_error

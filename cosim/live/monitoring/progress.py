@@ -17,9 +17,9 @@ from rich.progress import (
 from rich.progress import Progress as RichProgress
 
 from cosim.live.monitoring.line_times import begin_work, note_line, until_line_s
+from netem.core.command_line import print_to_stderr
+from netem.core.console import SafeConsole
 from noack.core.progress import Progress
-from noack.runtime.command_line import print_to_stderr
-from noack.runtime.console import SafeConsole
 
 _LEAST_WAIT_S = 0.1
 """Between two looks whether a line is due, of a work whose inner work prints."""

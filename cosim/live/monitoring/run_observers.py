@@ -6,9 +6,9 @@ from pathlib import Path
 from types import ModuleType
 
 from cosim.live.coordination.remote_access import ListenSettings
-from noack.core.errors import one_line
-from noack.core.extension_points import parts
-from noack.runtime.command_line import log_event, print_to_stderr
+from netem.core.command_line import log_event, print_to_stderr
+from netem.core.errors import one_line
+from netem.core.extension_points import parts
 from noack.runtime.control_messages import RunProgress
 from noack.scenario.scenario import Scenario
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Self
 from cosim.live.coordination.remote_access import ListenSettings
 from cosim.live.monitoring.line_times import begin_work, note_line, until_line_s
 from cosim.live.monitoring.run_observers import RunObserver
-from noack.runtime.address import address_text
+from netem.core.address import address_text
 from noack.runtime.control_messages import RunProgress
 from noack.scenario.scenario import Scenario, loop_names
 

@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cosim.live.processes.process_pool import ENDINGS, environment, process_starts
-from noack.core.errors import ExitStatus, MachineError, why
-from noack.core.file_access import open_append
-from noack.core.system_processes import require_limits
+from netem.core.errors import ExitStatus, MachineError, why
+from netem.core.file_access import open_append
+from netem.core.system_processes import require_limits
 from noack.protocol.roles import RECORDER
 from noack.runtime.run_descriptor import DESCRIPTOR_ON_STDIN, RunDescriptor
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Self
 
 from cosim.live.processes.process_pool import start_alone
 from cosim.record.run_directory import RunEnding
-from noack.core.system_processes import be_idle
+from netem.core.system_processes import be_idle
 
 if TYPE_CHECKING:
     from cosim.analysis.claims.run_certificates import RunCertificate

@@ -4,7 +4,7 @@ import gc
 import os
 from importlib import import_module
 
-from noack.core.system_processes import QUICK_IMPORTS
+from netem.core.system_processes import QUICK_IMPORTS
 
 _MODULES = (
     "plant_server.__main__",
@@ -32,8 +32,8 @@ def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
     from pydantic import BaseModel
 
-    from noack.impairments.kinds.loss import LossOf
-    from noack.impairments.link_settings import LinkSettings
+    from netem.impairments.kinds.loss import LossOf
+    from netem.impairments.link_settings import LinkSettings
     from noack.runtime.control_messages import ControlMessage
     from noack.runtime.run_descriptor import RunDescriptor
     from noack.scenario.scenario import Scenario

@@ -15,7 +15,7 @@ from multiprocessing.process import BaseProcess
 from types import ModuleType
 from typing import TypeVar
 
-from noack.runtime.command_line import END_SIGNALS
+from netem.core.command_line import END_SIGNALS
 
 _KEPT_BYTES = str(32 * 2**20)
 _ENVIRONMENT = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
@@ -23,7 +23,7 @@ _ENVIRONMENT = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NU
     "MALLOC_MMAP_THRESHOLD_": _KEPT_BYTES,
     "MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
 }
-"""One thread each, and no imports from the current folder (:mod:`noack.core.system_processes`). They
+"""One thread each, and no imports from the current folder (:mod:`netem.core.system_processes`). They
 keep freed memory: with new memory for each part of a record, half of the time is page faults."""
 
 _STARTS = threading.Lock()

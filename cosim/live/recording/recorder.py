@@ -22,12 +22,14 @@ from cosim.record.decimation import is_long
 from cosim.record.processes import kept_reports, report_of, write_reports
 from cosim.record.rows import Rows, messages_in
 from cosim.record.run_directory import RECORDING_FILE, active_run
-from noack.core.clock import NS_PER_S
-from noack.core.core_library import core
-from noack.core.errors import ExitStatus, MachineError, PeerError
-from noack.core.file_access import remove_file
-from noack.core.number_format import counted
-from noack.core.packet_rows import NETEM_PACKET, effective
+from netem.control.zenoh_session import header_of
+from netem.core.clock import NS_PER_S
+from netem.core.command_line import END_SIGNALS, print_to_stderr
+from netem.core.core_library import core
+from netem.core.errors import ExitStatus, MachineError, PeerError
+from netem.core.file_access import remove_file
+from netem.core.number_format import counted
+from netem.core.packet_rows import NETEM_PACKET, effective
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -36,8 +38,6 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.roles import LOOP_ROLES, RECORDER, Notice
-from noack.runtime.command_line import END_SIGNALS, print_to_stderr
-from noack.runtime.connections.zenoh_session import header_of
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.end_reasons import LAUNCHED_LOST_S, LAUNCHER_GONE

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cosim.record.rows import Rows
-from noack.core.errors import PeerError
+from netem.core.errors import PeerError
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import LOOP_ROLES, RECORDER, Notice
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message

@@ -15,8 +15,8 @@ from cosim.analysis.summary.summary_model import read_summary
 from cosim.record import data_frames
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object, require_output
 from cosim.record.run_record import Notice, RunRecord, load_run
-from noack.core.errors import CallerError
-from noack.core.extension_points import missing_extension, parts
+from netem.core.errors import CallerError
+from netem.core.extension_points import missing_extension, parts
 from noack.scenario.scenario import Scenario
 
 _ENDING = "_export"

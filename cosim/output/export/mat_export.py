@@ -14,7 +14,7 @@ from cosim.output.export.export_formats import ExportedRun
 from cosim.record.data_frames import events, samples
 from cosim.record.rows import Rows
 from cosim.record.run_directory import write_output
-from noack.core.errors import CallerError, MachineError
+from netem.core.errors import CallerError, MachineError
 from noack.scenario.scenario import Scenario
 
 SUFFIX = ".mat"

@@ -10,7 +10,7 @@ from pathlib import Path
 from cosim.output.figures.figure_format import SCREEN_IN, FigureFiles, FigureFormat, figure_width_in
 from cosim.output.figures.page_figure import GRID, INK, PAPER, PageFigure, figure_style
 from cosim.record.run_directory import write_output
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 
 _WITHOUT_DATE: dict[FigureFormat, dict[str, str | None]] = {
     FigureFormat.SVG: {"Date": None, "Creator": None, "Format": None, "Type": None},

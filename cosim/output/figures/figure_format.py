@@ -3,8 +3,8 @@
 from enum import StrEnum
 from typing import NamedTuple
 
-from noack.core.errors import CallerError
-from noack.core.number_checks import one_of
+from netem.core.errors import CallerError
+from netem.core.number_checks import one_of
 
 SCREEN_IN = 10.0
 """Width of a figure on a page of noack, in inches."""

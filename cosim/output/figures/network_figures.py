@@ -23,7 +23,7 @@ from cosim.output.figures.panels import Panels, add_colour_bar, labels_in
 from cosim.output.figures.run_figures import envelopes, run_figures
 from cosim.record.align import Reals
 from cosim.record.run_record import RecordedRun
-from noack.core.number_format import number
+from netem.core.number_format import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -56,10 +56,10 @@ from cosim.record.align import AlignedRun, Reals, aligned_parts
 from cosim.record.decimation import decimate_all
 from cosim.record.run_events import packet_outcomes, reference_in_run
 from cosim.record.run_record import Rows, RunRecord
-from noack.core.clock import NS_PER_S
-from noack.core.packet_rows import Fate
-from noack.core.row_operations import row_norms
-from noack.guarantee.loss_guarantee import LossesInWindow
+from netem.core.clock import NS_PER_S
+from netem.core.packet_rows import Fate
+from netem.core.row_operations import row_norms
+from netem.guarantee.loss_guarantee import LossesInWindow
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP
 from noack.protocol.wire_format import Flow
 from noack.scenario.outputs import LoopOutput

@@ -26,7 +26,7 @@ from cosim.output.figures.palette import CONTROLLER, SENSOR, THRESHOLD, Colour
 from cosim.output.figures.panels import Panels
 from cosim.record.align import Reals
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.protocol.roles import LOOP_ROLES
 
 if TYPE_CHECKING:

@@ -19,10 +19,10 @@ from cosim.output.viewer.loop_feed import LAG_S, SHOWN_TABLES, LoopFeed, log_lev
 from cosim.output.viewer.run_recording import ALL_ERRORS, ALL_SIZES, RunRecording
 from cosim.record.align import Reals
 from cosim.record.rows import Rows, rows_by_loop
-from noack.core.clock import NEVER_NS, NS_PER_S
+from netem.core.clock import NEVER_NS, NS_PER_S
+from netem.core.packet_rows import NETEM_PACKET
+from netem.core.row_operations import row_norms
 from noack.core.linear_systems import Propagator
-from noack.core.packet_rows import NETEM_PACKET
-from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, LOOP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import ResolvedRun, loop_of, tables_of
 

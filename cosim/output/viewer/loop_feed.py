@@ -24,8 +24,8 @@ from cosim.record.align import (
 from cosim.record.decimation import decimate_all
 from cosim.record.rows import Rows, concatenate_rows, messages_in
 from cosim.record.run_events import claimed_until_s, model_flow
-from noack.core.clock import NS_PER_S
-from noack.core.packet_rows import NETEM_PACKET, Fate, effective
+from netem.core.clock import NS_PER_S
+from netem.core.packet_rows import NETEM_PACKET, Fate, effective
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_SETTING,

@@ -20,9 +20,9 @@ from cosim.output.viewer.network_diagram import DIAGRAM, LEG_S
 from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, concatenate_frames
 from cosim.record.align import AlignedRun, Reals, Times
 from cosim.record.run_directory import Kind
-from noack.core.clock import NS_PER_S
-from noack.core.errors import MachineError, why
-from noack.core.file_access import open_growing
+from netem.core.clock import NS_PER_S
+from netem.core.errors import MachineError, why
+from netem.core.file_access import open_growing
 from noack.scenario.scenario import Scenario
 
 APPLICATION_ID = "noack"

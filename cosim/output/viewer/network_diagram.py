@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, NETWORK, PLANT, SENSOR
 from cosim.output.viewer.pictures.picture import STILL, Columns, Shape, label, lines, style, upright
 from cosim.record.align import Reals, Times
-from noack.core.clock import NS_PER_S
-from noack.core.packet_rows import Fate, effective
+from netem.core.clock import NS_PER_S
+from netem.core.packet_rows import Fate, effective
 from noack.protocol.wire_format import Flow
 
 DIAGRAM = "network"

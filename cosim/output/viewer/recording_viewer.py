@@ -48,9 +48,9 @@ from cosim.output.viewer.rerun_program import (
     window_port,
 )
 from cosim.record.run_directory import RECORDING_FILE, SUMMARY_FILE, loop_of_file, read_object
-from noack.core.clock import NS_PER_S
-from noack.core.errors import ExitStatus, MachineError, PeerError, why
-from noack.core.system_processes import python_command
+from netem.core.clock import NS_PER_S
+from netem.core.errors import ExitStatus, MachineError, PeerError, why
+from netem.core.system_processes import python_command
 
 RECORDING = "recording.rrd"
 """Last part of the address of a recording."""

@@ -25,8 +25,8 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, MachineError, PeerError
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError, MachineError, PeerError
 
 NOT_INSTALLED = "the viewer's package is not installed: pip install 'noack[viewer]'"
 _PR_SET_PDEATHSIG = 1

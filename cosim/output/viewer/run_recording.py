@@ -53,7 +53,7 @@ from cosim.record.align import Reals, Times
 from cosim.record.decimation import is_long
 from cosim.record.run_directory import RECORDING_FILE, Kind, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.resolution import ResolvedRun, loop_of
 from noack.scenario.scenario import Scenario

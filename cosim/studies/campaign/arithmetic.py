@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import expm
 
-from noack.core.core_library import SOURCES
-from noack.core.errors import shortened
+from netem.core.core_library import SOURCES
+from netem.core.errors import shortened
 
 _PACKAGES = ("noack", "numpy", "scipy")
 _CODE = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")

@@ -15,10 +15,10 @@ from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_valid
 
 from cosim.simulation.exact_simulation import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
-from noack.core.errors import CallerError
-from noack.scenario import toml_file
+from netem.core import toml_file
+from netem.core.errors import CallerError
+from netem.core.settings_section import FolderName, ScenarioSection, Seed
 from noack.scenario.symbols import ScenarioRoot
-from noack.settings.section import FolderName, ScenarioSection, Seed
 from noack.settings.values import MatrixRows
 
 MOST_POINTS = 10_000

@@ -18,14 +18,14 @@ from cosim.studies.campaign.campaign_workers import Work
 from cosim.studies.campaign.drawn_runs import SampledWork, SharedNetworkWork, in_virtual_time, measured_rows
 from cosim.studies.campaign.metrics import METRICS, OF_THRESHOLD, certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
-from noack.core.errors import CallerError
+from netem.core import toml_file
+from netem.core.errors import CallerError
+from netem.core.settings_section import Table
 from noack.core.linear_systems import Matrix
-from noack.scenario import toml_file
 from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.resolution import ResolvedRun, policy_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put
-from noack.settings.section import Table
 from noack.settings.values import MatrixRows, require_shape
 
 SCENARIOS = "scenarios"

@@ -21,11 +21,11 @@ from cosim.studies.campaign.campaign_summary import CampaignSummary, summarise
 from cosim.studies.campaign.campaign_workers import Runner
 from cosim.studies.campaign.chunk_store import RUNS, Store, locked_folder, run_campaign
 from cosim.studies.campaign.metrics import Estimate, Metric, to_shown_unit
-from noack.core.file_access import write_whole
-from noack.core.number_checks import whole_number
-from noack.core.number_format import plus_minus
+from netem.core.command_line import stop_requests_raised
+from netem.core.file_access import write_whole
+from netem.core.number_checks import whole_number
+from netem.core.number_format import plus_minus
 from noack.core.progress import Progress, no_progress
-from noack.runtime.command_line import stop_requests_raised
 
 PAGE, SUMMARY = CAMPAIGN_PAGE, SUMMARY_FILE
 _NONE = "–"

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from cosim.live.processes.process_pool import process_starts, processes
 from cosim.studies.campaign.arithmetic import arithmetic, difference
-from noack.core.errors import CallerError, PeerError
-from noack.core.number_checks import whole_number
-from noack.core.system_processes import cores
+from netem.core.errors import CallerError, PeerError
+from netem.core.number_checks import whole_number
+from netem.core.system_processes import cores
 
 
 class Work(Protocol):

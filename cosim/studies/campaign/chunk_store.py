@@ -23,9 +23,9 @@ from cosim.studies.campaign.arithmetic import arithmetic, difference
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point, row_type
 from cosim.studies.campaign.campaign_workers import Chunk, LostWorkersError, OtherArithmeticError, Runner
-from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
-from noack.core.file_access import PARTIAL, create_folder, locked, remove_file, write_whole
-from noack.core.json_text import parse_json
+from netem.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
+from netem.core.file_access import PARTIAL, create_folder, locked, remove_file, write_whole
+from netem.core.json_text import parse_json
 from noack.core.progress import Progress, no_progress
 
 RUNS = "runs"

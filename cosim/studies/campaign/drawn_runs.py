@@ -24,9 +24,9 @@ from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.exact_simulation import DIVERGED, OK, ROW, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.random_draws import drawn_scenario, seeds_of
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
+from netem.core.packet_rows import NETEM_PACKET, effective
 from noack.core.linear_systems import Matrix
-from noack.core.packet_rows import NETEM_PACKET, effective
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import ResolvedRun, policy_of
 from noack.scenario.run_sections import PortsSection, RealtimeSection, SeedsSection

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.special import bdtr, stdtrit
 
 from cosim.simulation.exact_simulation import OK
+from netem.guarantee.loss_guarantee import LongestBurst, LossGuarantee
+from netem.impairments.markov_chain import NotPredictableError
+from netem.impairments.target_loss import loss_process
 from noack.core.linear_systems import Vector
-from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
-from noack.impairments.markov_chain import NotPredictableError
-from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.response_bounds import NotDecayingError, bound_response

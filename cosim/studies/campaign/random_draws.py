@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.simulation.exact_simulation import Population
+from netem.core.random_streams import uniforms, words
 from noack.core.linear_systems import Matrix, Vector
-from noack.core.random_streams import uniforms, words
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.run_sections import SeedsSection
 from noack.scenario.scenario import Scenario

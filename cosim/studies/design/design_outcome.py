@@ -13,8 +13,8 @@ from cosim.output.figures.axes_parts import draw_line, rgb, whole_numbers
 from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.studies.design.design_search import designed_name
 from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
-from noack.core.clock import NS_PER_S
-from noack.core.number_format import NONE, at_least, at_most
+from netem.core.clock import NS_PER_S
+from netem.core.number_format import NONE, at_least, at_most
 from noack.core.progress import Progress, no_progress
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, toml_text

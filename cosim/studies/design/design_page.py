@@ -16,7 +16,7 @@ from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.studies.design.design_outcome import HEIGHT_IN, DesignOutcome
 from cosim.studies.design.design_search import WORDS, DesignResult, certified
-from noack.core.number_format import plus_minus
+from netem.core.number_format import plus_minus
 from noack.scenario.scenario_file import dumps
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from cosim.studies.campaign.campaign_figures import undominated
 from cosim.studies.campaign.metrics import estimate, interval_ranks, quantile_interval
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.design.design_space import DesignSpace, TriggerCandidate, space_of
-from noack.core.errors import CallerError
-from noack.core.number_format import at_most, plus_minus
+from netem.core.errors import CallerError
+from netem.core.number_format import at_most, plus_minus
 from noack.core.progress import Progress, no_progress
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario

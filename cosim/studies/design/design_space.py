@@ -14,9 +14,9 @@ import numpy as np
 
 from cosim.analysis.mean_cost import require_weight
 from cosim.studies.regulator import lqr_gain
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.core.number_format import to_digits
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.core.number_format import to_digits
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.values import MatrixRows

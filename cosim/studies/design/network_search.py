@@ -20,10 +20,10 @@ import numpy as np
 
 from cosim.studies.design.design_space import round_gain, weighed_gain
 from cosim.studies.design.quick_estimate import PatternGraph, QuickLoop
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.guarantee.loss_guarantee import LossGuarantee
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.core.progress import Progress, no_progress
-from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.values import MatrixRows, rows_of

@@ -14,18 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 from cosim.record.run_directory import write_output
 from cosim.studies.new_loop.plant_reference import PlantReference, plant_reference
 from cosim.studies.regulator import lqr_gain
-from noack.core.errors import CallerError
-from noack.core.json_text import parse_json
+from netem.core.errors import CallerError
+from netem.core.json_text import parse_json
+from netem.core.number_checks import real_number
+from netem.core.number_format import TextRows, as_text, to_digits
+from netem.core.settings_section import ReadTable, Table
 from noack.core.linear_systems import Matrix, Vector, norm
-from noack.core.number_checks import real_number
-from noack.core.number_format import TextRows, as_text, to_digits
 from noack.core.pole_placement import place_poles
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
 from noack.plants.systems.linearisation import linearise as linear_motion
 from noack.scenario.given_settings import given_settings
 from noack.scenario.integrals import augmented, require_held
 from noack.scenario.sections import instability
-from noack.settings.section import ReadTable, Table
 from noack.settings.user_files import UserCode
 
 TOLERANCE = 1e-6

@@ -45,18 +45,18 @@ from cosim.studies.new_loop.linear_model import (
     model_or_gain,
     parse_vector,
 )
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, MachineError, why
-from noack.core.file_access import new_file
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError, MachineError, why
+from netem.core.file_access import new_file
+from netem.core.number_checks import real_number
+from netem.core.number_format import to_digits
+from netem.core.settings_section import ReadTable, Table
 from noack.core.linear_systems import Matrix, Vector, discretise, norm
-from noack.core.number_checks import real_number
-from noack.core.number_format import to_digits
 from noack.plants.linear import LinearSettings
 from noack.scenario.given_settings import given_settings
 from noack.scenario.resolution import resolve, resolve_run
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, network_of, put, toml_text, with_file_names
-from noack.settings.section import ReadTable, Table
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.coverage import require_linear
 from noack.theory.response_bounds import NotDecayingError

@@ -9,18 +9,19 @@ from pathlib import Path
 import numpy as np
 
 from cosim.shipped_files import find_shipped, shipped_names
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, did_you_mean, one_line, why
-from noack.core.extension_points import missing_extension
+from netem.core import toml_file
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError, did_you_mean, one_line, why
+from netem.core.extension_points import missing_extension
+from netem.core.settings_section import ReadTable, Table
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.linear import LinearSettings
 from noack.plants.plant_settings import PlantSettings, PlantStart, PlantSystem, name_and_unit, plain_name
 from noack.plants.python_plant import PythonPlantSettings
 from noack.plants.systems.linearisation import STEP_NS
-from noack.scenario import scenario_file, toml_file
+from noack.scenario import scenario_file
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.sections import PLANTS
-from noack.settings.section import ReadTable, Table
 from noack.settings.user_files import with_absolute_path
 
 _LARGEST_TRIED_SIZE = 16

@@ -15,11 +15,11 @@ from scipy.linalg import expm, logm
 import noack
 from cosim.analysis.summary.plant_linearisation import linearisation
 from cosim.analysis.summary.summary_model import LinearisationPart
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.core.toml_file import validated
 from noack.extend import PlantStart, SystemFailedError
 from noack.plants.systems.linearisation import linearise
 from noack.scenario.resolution import resolve
-from noack.scenario.toml_file import validated
 from noack_gymnasium.gymnasium_plant import GymnasiumSettings
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.helpers.command_line import invoke

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import noack
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import AT_RATE
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from noack.core.errors import NoackError, one_line, shortened
+from netem.core.errors import NoackError, one_line, shortened
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import PlantSystem
 from noack_check.balls import number

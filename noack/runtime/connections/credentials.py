@@ -12,10 +12,10 @@ import socket
 import stat
 from pathlib import Path
 
-from noack.core.errors import CallerError, NoAnswerError, PeerError, why
-from noack.core.file_access import open_regular
+from netem.core.address import Address, address_text, family_of
+from netem.core.errors import CallerError, NoAnswerError, PeerError, why
+from netem.core.file_access import open_regular
 from noack.protocol.roles import COORDINATOR, LOOP_ROLES
-from noack.runtime.address import Address, address_text, family_of
 from noack.runtime.run_descriptor import RunDescriptor, parse_descriptor
 
 RUN_FILE = "run.json"

@@ -11,8 +11,9 @@ import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
-from noack.core.clock import RunClock
-from noack.core.core_library import CData, core, ffi, new_handle
+from netem.core.address import Address, SocketName, packed_name
+from netem.core.clock import RunClock
+from netem.core.core_library import CData, core, ffi, new_handle
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.wire_format import (
     HEADER_BYTES,
@@ -23,7 +24,6 @@ from noack.protocol.wire_format import (
     reception_report,
     rejected_of,
 )
-from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.counting_sockets import CountingSockets, errors_by_text
 from noack.runtime.drivers.real_time_loop import RecordSink
 

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.clock import NS_PER_S, RunClock
+from netem.core.clock import NS_PER_S, RunClock
 from noack.protocol.roles import Notice, Record
 
 _HOUSEKEEPING_S = 0.05

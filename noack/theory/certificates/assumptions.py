@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
+from netem.core.number_format import at_least
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.core.number_format import at_least
 from noack.scenario.estimation import SteadyState, steady_state
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario

@@ -7,8 +7,8 @@ from typing import Literal, Self
 
 import numpy as np
 
+from netem.core.number_format import at_most
 from noack.core.linear_systems import Matrix, Vector
-from noack.core.number_format import at_most
 from noack.theory.certificates.assumptions import Assumption
 from noack.theory.certificates.conditions import BOX, NetworkConditions
 from noack.theory.certificates.proven_bounds import ProvenBounds

@@ -10,19 +10,19 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netem.core.clock import NS_PER_S
+from netem.core.periods import exact_ns
+from netem.core.settings_section import Table
+from netem.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossRule
+from netem.impairments.markov_chain import NotPredictableError
+from netem.impairments.target_loss import loss_process
 from noack.core.cached_method import cached_method
-from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
-from noack.core.periods import exact_ns
 from noack.core.references import Reference
-from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossRule
-from noack.impairments.markov_chain import NotPredictableError
-from noack.impairments.target_loss import loss_process
 from noack.references.segment import SolutionSegment
 from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
-from noack.settings.section import Table
 from noack.settings.values import MatrixRows
 from noack.theory.certificates.normal_values import normal_limit, with_bounded_values
 from noack.theory.certificates.proven_bounds import ProvenBounds
@@ -192,7 +192,7 @@ def network_delay_text(resolved: Scenario) -> str:
 def network_delay_ns(resolved: Scenario, late_periods: int) -> int:
     """Return the longest time for which the network may delay an update under these conditions."""
     timing, delay_s = resolved.timing, certified_delay_s(resolved)
-    if not timing.has_whole_periods:  # whole steps take as many: see noack.core.periods
+    if not timing.has_whole_periods:  # whole steps take as many: see netem.core.periods
         return math.floor(late_periods * timing.plant_period.exact) + int(exact_ns(delay_s) if delay_s else 0)
     return late_periods * timing.plant_period_ns + math.ceil(delay_s * NS_PER_S)
 

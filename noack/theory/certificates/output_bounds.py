@@ -8,7 +8,7 @@ where the loop rests under them.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from noack.core.number_format import at_most
+from netem.core.number_format import at_most
 from noack.scenario.outputs import LoopOutput
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from noack.core.errors import NoackError
+from netem.core.errors import NoackError
 from noack.plants.plant_settings import PlantStart, PlantSystem
 from noack.plants.systems.traced_equations import NotEnclosedError
 from noack.scenario.resolution import loop_of

@@ -6,8 +6,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from netem.core.number_format import at_least, at_most
 from noack.core.linear_systems import Vector
-from noack.core.number_format import at_least, at_most
 
 
 class ProvenBound(NamedTuple):

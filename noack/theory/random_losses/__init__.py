@@ -1,6 +1,6 @@
 """Time-triggered loops whose losses are random: moments instead of bounds for all patterns.
 
-The losses are a Markov chain over the packets (``noack/impairments/loss_prediction.py``), with or
+The losses are a Markov chain over the packets (``netem/impairments/loss_prediction.py``), with or
 without a limit on consecutive losses. From one transmission to the next the state becomes M₀z or
 M₁z, so the second moments follow a linear map.
 

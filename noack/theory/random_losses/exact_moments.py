@@ -32,11 +32,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netem.core.errors import CallerError
+from netem.impairments.loss_prediction import OutcomeChain
+from netem.impairments.markov_chain import NotPredictableError
 from noack.core.cached_method import cached_method
-from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Stack, Vector, balancing_exponents, exponential
-from noack.impairments.loss_prediction import OutcomeChain
-from noack.impairments.markov_chain import NotPredictableError
 from noack.proof.period_times import LoopTimes
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario

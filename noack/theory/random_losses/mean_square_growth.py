@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from netem.guarantee.loss_guarantee import LossGuarantee
+from netem.impairments.loss_prediction import LossProcess, OutcomeChain
+from netem.impairments.markov_chain import NotPredictableError
 from noack.core.linear_systems import Matrix, Stack, Vector, balancing_exponents
-from noack.guarantee.loss_guarantee import LossGuarantee
-from noack.impairments.loss_prediction import LossProcess, OutcomeChain
-from noack.impairments.markov_chain import NotPredictableError
 from noack.proof.period_times import NEVER, LoopTimes
 from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.resolution import loop_of

@@ -17,7 +17,7 @@ import numpy as np
 from flint import arb, arb_mat, ctx, fmpq
 from numpy.typing import NDArray
 
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 
 _UNIT_ROUNDOFF = 2.0**-53

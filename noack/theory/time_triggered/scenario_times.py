@@ -9,10 +9,10 @@ from fractions import Fraction
 
 import numpy as np
 
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError
+from netem.impairments.kinds.delay import Delay
 from noack.core.linear_systems import Vector
-from noack.impairments.kinds.delay import Delay
 from noack.proof.period_times import NEVER, LoopTimes
 from noack.scenario.arrival_ties import WITHOUT_DELAY
 from noack.scenario.resolution import reference_of, rule_of

@@ -14,8 +14,8 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
 
-from noack.core.errors import CallerError
-from noack.guarantee.loss_guarantee import (
+from netem.core.errors import CallerError
+from netem.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
     LossesInWindow,

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from noack.core.errors import CallerError
-from noack.guarantee.loss_guarantee import LossGuarantee
+from netem.core.errors import CallerError
+from netem.guarantee.loss_guarantee import LossGuarantee
 from noack.proof.forms_proof import FORMAT, as_text
 from noack.proof.period_document import PeriodDocument, PeriodLoop, PeriodOutput
 from noack.proof.period_graph import PeriodGraph

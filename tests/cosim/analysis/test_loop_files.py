@@ -9,7 +9,7 @@ from cosim.analysis.loop_files import loop_files
 from cosim.analysis.witness_store import INDEX, SHIPPED
 from cosim.analysis.witnesses import find_witnesses
 from cosim.shipped_files import shipped_names
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 from noack.scenario.resolution import ResolvedRun
 from noack_verify.__main__ import main
 from tests.helpers.command_line import invoke

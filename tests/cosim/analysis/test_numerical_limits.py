@@ -14,7 +14,7 @@ from cosim.record.divergence import GROWTH, Divergence, divergence
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import run_continuous, summary
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError, ExitStatus
+from netem.core.errors import CallerError, ExitStatus
 from noack.core.linear_systems import Matrix, Vector
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario

@@ -7,8 +7,8 @@ import pytest
 
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
-from noack.core.packet_rows import NETEM_PACKET
+from netem.core.errors import CallerError
+from netem.core.packet_rows import NETEM_PACKET
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario import Scenario, loops_of

@@ -9,7 +9,7 @@ import tomli_w
 
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.cli.live_settings import parse_settings
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.runtime import active_runs
 from noack.runtime.run_descriptor import RunDescriptor, new_access, new_descriptor
 from noack.scenario.parameter_changes import changed

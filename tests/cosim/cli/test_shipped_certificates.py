@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import noack
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 from noack.scenario.scenario import loop_names
 from tests.helpers.command_line import invoke
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from noack.runtime.standard_streams import guarded_stream
+from netem.core.standard_streams import guarded_stream
 
 NOACK = (sys.executable, "-m", "cosim.cli")
 ROOT = Path(__file__).parents[3]

@@ -10,7 +10,7 @@ import pytest
 from cosim.live.disk_space import require_disk_space
 from cosim.live.launcher import launch
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import MachineError
+from netem.core.errors import MachineError
 from noack.scenario.resolution import ResolvedRun, resolve, resolve_run
 from noack.scenario.scenario_file import validate
 

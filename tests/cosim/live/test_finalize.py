@@ -34,7 +34,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import load_record, load_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate, simulate_run
-from noack.core.errors import CallerError, ExitStatus, MachineError
+from netem.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.scenario import Scenario

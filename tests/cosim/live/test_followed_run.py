@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import noack
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 
 
 def test_a_run_that_is_not_active_is_refused(tmp_path: Path) -> None:

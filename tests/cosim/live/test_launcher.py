@@ -12,9 +12,9 @@ from cosim.live.launcher import _Run
 from cosim.live.monitoring.run_observers import RunObserver, RunObservers
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
 from cosim.live.processes.early_certificates import EarlyCertificates
-from noack.core.errors import ExitStatus
+from netem.core.command_line import Signals
+from netem.core.errors import ExitStatus
 from noack.protocol.roles import RECORDER, ROLES
-from noack.runtime.command_line import Signals
 from noack.scenario.resolution import resolve_run
 from noack.scenario.scenario_file import validate
 from tests.helpers.waiting import wait_for

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 import noack
 from cosim.measurement.certificate_time import DELAY, certificate_time
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 from noack.scenario.scenario import Scenario
-from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 
 MS = 1_000_000
 

@@ -5,17 +5,17 @@ from pathlib import Path
 
 import pytest
 from click.testing import Result
+from tests.cosim.measurement.chains import chain_losses, trace_of
 
 import noack
-from cosim.measurement.chain_fits import ChainRates
 from cosim.measurement.network_section import trace_csv
-from noack.scenario import toml_file
+from netem.core import toml_file
+from netem.measurement.chain_fits import ChainRates
 from noack.scenario.sections import NetworkSection
-from tests.cosim.measurement.chains import chain_losses, trace_of
 from tests.helpers.command_line import invoke
 
-RURAL = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g" / "rural_n8_10kmh.csv"
-IRTT = Path(__file__).parents[2] / "noack/traces" / "irtt.json"
+RURAL = Path(__file__).parents[3] / "netem/traces/shipped/cicv5g" / "rural_n8_10kmh.csv"
+IRTT = Path(__file__).parents[2] / "netem/traces" / "irtt.json"
 
 
 def measure(*words: object) -> Result:

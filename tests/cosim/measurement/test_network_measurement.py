@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 import noack
 from cosim.measurement.certificate_time import measured_certificate_time
 from cosim.measurement.measurement_outputs import measurement_figures, measurement_tables
-from cosim.measurement.network_measurement import (
+from netem.measurement.network_measurement import (
     MeasurementOptions,
     NetworkMeasurement,
     autocorrelation,
     normal_scores,
 )
-from noack.traces.packet_trace import packet_trace
+from netem.traces.packet_trace import packet_trace
 
 
 def test_correlation_is_that_of_an_autoregressive_delay() -> None:

@@ -4,16 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
 
 import noack
-from cosim.measurement.chain_fits import ChainRates
-from cosim.measurement.loss_bursts import histogram
 from cosim.measurement.network_section import trace_csv
-from noack.impairments.target_loss import read_files
-from noack.scenario import toml_file
+from netem.core import toml_file
+from netem.impairments.target_loss import read_files
+from netem.measurement.chain_fits import ChainRates
+from netem.measurement.loss_bursts import histogram
+from netem.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 from noack.scenario.sections import NetworkSection
-from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
-from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
 from tests.helpers.command_line import invoke
 from tests.netem.stepped_link import Link
 

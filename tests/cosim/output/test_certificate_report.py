@@ -18,7 +18,7 @@ from cosim.output.certificate_report import certificate_document, certificate_ta
 from cosim.output.document import Sentence
 from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
 from noack.theory.certificates.conditions import allowed_conditions, outside_box
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds

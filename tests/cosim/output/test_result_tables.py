@@ -10,7 +10,7 @@ import pytest
 import noack
 from cosim.output import result_tables
 from cosim.output.run_tables import summary_tables
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from tests.helpers.command_line import invoke
 
 

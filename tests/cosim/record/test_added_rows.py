@@ -20,8 +20,8 @@ from cosim.record.run_record import Rows, RunRecord, load_record
 from cosim.record.run_scenario import write_scenario
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, MachineError, NoackError
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError, MachineError, NoackError
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.runtime.control_messages import ClockError
 from noack.runtime.kept_rows import KeptFile, KeptHead

@@ -13,8 +13,8 @@ from cosim.record.align import align_tables
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
-from noack.core.packet_rows import NETEM_PACKET
+from netem.core.errors import CallerError
+from netem.core.packet_rows import NETEM_PACKET
 from noack.protocol.record_tables import NETEM_SETTING
 from noack.protocol.roles import Notice
 from noack.protocol.wire_format import Flow, Message

@@ -40,7 +40,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import load_record
 from cosim.record.spool_conversion import finish_record
 from cosim.record.table_files import TableFile, write_table
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.protocol.record_tables import COMMON, LOOP, PLANT_STEP, TABLES, Column, Table
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 from tests.fuzz.parsers.record import NOTICE, files, spooled

@@ -16,8 +16,8 @@ from cosim.record.run_scenario import write_scenario
 from cosim.record.spool_conversion import Segment, finish_record, merge_segments
 from cosim.record.table_files import TableFile, write_table
 from cosim.simulation.virtual_time import simulate_loops
-from noack.core.errors import MachineError
-from noack.core.packet_rows import NETEM_PACKET
+from netem.core.errors import MachineError
+from netem.core.packet_rows import NETEM_PACKET
 from noack.protocol.record_tables import LOOP, PLANT_STEP, network_tables
 from noack.protocol.roles import Notice
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of

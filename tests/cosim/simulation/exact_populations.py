@@ -10,19 +10,19 @@ from scipy.integrate import solve_ivp
 
 from cosim.simulation.continuous import ContinuousLoop, ContinuousRun, simulate_continuous
 from cosim.simulation.exact_simulation import OK, Events, Population, Setting, run_batch, run_with_events
+from netem.core.packet_rows import Fate
+from netem.impairments.constraints.at_most import AtMost
+from netem.impairments.kinds.corrupt import Corrupt
+from netem.impairments.kinds.loss import LossOf
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.loss_models.bernoulli import BernoulliLoss
+from netem.impairments.loss_models.four_state import FourStateLoss
+from netem.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from netem.impairments.loss_models.lossless import NoLoss
+from netem.impairments.loss_models.periodic_loss import PeriodicLoss
+from netem.impairments.loss_models.scripted import ScriptedLoss
+from netem.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.core.linear_systems import Matrix, Vector
-from noack.core.packet_rows import Fate
-from noack.impairments.constraints.at_most import AtMost
-from noack.impairments.kinds.corrupt import Corrupt
-from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.impairments.loss_models.four_state import FourStateLoss
-from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
-from noack.impairments.loss_models.lossless import NoLoss
-from noack.impairments.loss_models.periodic_loss import PeriodicLoss
-from noack.impairments.loss_models.scripted import ScriptedLoss
-from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.machines.run_channel import UPDATE_LINK
 from noack.scenario.resolution import LoopMatrices
 from noack.trigger_policies.trigger_rule import QuadraticForm

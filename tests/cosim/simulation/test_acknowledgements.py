@@ -11,11 +11,11 @@ from cosim.output.claim_words import claim_reason
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
-from noack.core.packet_rows import NETEM_PACKET, Fate
-from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from netem.core.errors import CallerError
+from netem.core.packet_rows import NETEM_PACKET, Fate
+from netem.impairments.kinds.loss import LossOf
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.protocol.record_tables import ACKNOWLEDGEMENTS, UPDATES
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus, paper_assumptions

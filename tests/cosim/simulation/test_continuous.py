@@ -19,9 +19,9 @@ from cosim.simulation.continuous import (
     simulate_continuous,
 )
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.core.packet_rows import NETEM_PACKET, Fate
 from noack.core.linear_systems import Matrix, Vector
-from noack.core.packet_rows import NETEM_PACKET, Fate
 from noack.scenario.resolution import LoopMatrices, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load

@@ -9,10 +9,10 @@ import pytest
 
 from cosim.simulation.continuous import TooManyEventsError, run_continuous
 from cosim.simulation.exact_simulation import TOO_MANY_EVENTS, Population, Setting, run_batch, setting_of
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.impairments.kinds.delay import Delay
+from netem.impairments.link_settings import LinkSettings
 from noack.core.linear_systems import Matrix
-from noack.impairments.kinds.delay import Delay
-from noack.impairments.link_settings import LinkSettings
 from noack.scenario.resolution import loop_of
 from noack.trigger_policies.trigger_rule import TriggerRule
 from tests.cosim.simulation.exact_populations import (

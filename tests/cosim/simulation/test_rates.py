@@ -10,7 +10,7 @@ import pytest
 import noack
 from cosim.analysis.replay import replay
 from cosim.simulation.virtual_time import simulate
-from noack.core.periods import MOST_PARTS, period_of
+from netem.core.periods import MOST_PARTS, period_of
 from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario_file import validate
 from noack.trigger_policies.quadratic import QuadraticSettings

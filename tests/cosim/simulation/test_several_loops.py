@@ -10,7 +10,7 @@ from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay_run
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, Fate
+from netem.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, Fate
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.wire_format import HEADER_ROW, datagram_bytes
 from noack.scenario.resolution import resolve, resolve_run

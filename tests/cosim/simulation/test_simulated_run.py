@@ -15,8 +15,8 @@ from cosim.output.viewer import blueprint
 from cosim.record.run_directory import RunEnding, write_environment
 from cosim.record.run_record import RecordedRun, RunRecord, load_record
 from cosim.simulation.virtual_time import Progress, simulate_run
-from noack.core.errors import ExitStatus, MachineError
-from noack.core.number_format import number as written
+from netem.core.errors import ExitStatus, MachineError
+from netem.core.number_format import number as written
 from noack.protocol.record_tables import tables
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load

@@ -12,24 +12,24 @@ import numpy as np
 import tomli_w
 
 from cosim.measurement.run_trace import read_source
-from cosim.measurement.trace_sources import SourceOptions
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_grid import grid
-from noack.core.errors import NoackError
-from noack.impairments.kinds.blackout import Blackout
-from noack.impairments.kinds.delay import Delay
-from noack.impairments.kinds.loss import LossOf
-from noack.impairments.kinds.opportunities import Opportunities
-from noack.impairments.kinds.replay import Replay
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.trace import TraceLoss
-from noack.impairments.target_loss import read_files
+from netem.core.errors import NoackError
+from netem.core.named_file import NamedFile
+from netem.core.toml_file import json_schema
+from netem.impairments.kinds.blackout import Blackout
+from netem.impairments.kinds.delay import Delay
+from netem.impairments.kinds.loss import LossOf
+from netem.impairments.kinds.opportunities import Opportunities
+from netem.impairments.kinds.replay import Replay
+from netem.impairments.link_settings import LinkSettings
+from netem.impairments.loss_models.trace import TraceLoss
+from netem.impairments.target_loss import read_files
+from netem.measurement.trace_sources import SourceOptions
 from noack.scenario.matrix_files import read_matrices
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, load, validate
-from noack.scenario.toml_file import json_schema
-from noack.settings.named_file import NamedFile
 from tests.fuzz.edits import Choices, Vocabulary, bases, edited, key, quoted, value, vocabulary, write_named
 from tests.fuzz.harness import FOLDER, refusal, workspace
 from tests.oracles.capture_files import (

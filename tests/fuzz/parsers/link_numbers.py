@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from netem.core.core_library import core, ffi, pointer_to
+from netem.impairments.link_settings import LinkSettings
 from netem.link_state import _link_numbers
-from noack.core.core_library import core, ffi, pointer_to
-from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.edits import Choices
-from tests.noack.impairments.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
+from tests.netem.impairments.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
 
 _COMPUTABLE = [
     impairment for impairment in IMPAIRED if not names_file(impairment) and not keeps_loss(impairment)

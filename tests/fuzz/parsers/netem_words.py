@@ -10,20 +10,20 @@ from unittest.mock import patch
 import tomli_w
 
 from netem.control.control_server import ControlServer, SettingsChange
+from netem.core.errors import CallerError
 from netem.explanation import tc_command
+from netem.impairments.kinds.delay import SHAPES
+from netem.impairments.link_settings import LinkSettings
 from netem.links_file import json_schema, load_links
 from netem.relay.relay_reports import DIRECTIONS
 from netem.tc_words import EXAMPLES as ANY_WORD
 from netem.tc_words import parse, settings_of, words_of
-from noack.core.errors import CallerError
-from noack.impairments.kinds.delay import SHAPES
-from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.edits import NAMED, Choices, Vocabulary, damaged, edited, quoted, vocabulary, write_named
 from tests.fuzz.harness import refusal, workspace
 from tests.fuzz.plane import Query
 from tests.netem.control.fake_relay import FakeRelay
-from tests.noack.impairments.any_link_settings import words_can_say
-from tests.noack.impairments.feature_examples import CONSTRAINED, IMPAIRED
+from tests.netem.impairments.any_link_settings import words_can_say
+from tests.netem.impairments.feature_examples import CONSTRAINED, IMPAIRED
 
 EXAMPLES = (
     *(example.text() for example in (*IMPAIRED, *CONSTRAINED)),
@@ -130,7 +130,7 @@ def links_input(choices: Choices) -> None:
     else:
         data = choices.near(LINKS_SEEDS, LINKS_WORDS)
     path = write_named(workspace(), "links.toml", data)
-    with refusal(str(path), lines=True), patch("noack.runtime.address.socket.getaddrinfo", numeric):
+    with refusal(str(path), lines=True), patch("netem.core.address.socket.getaddrinfo", numeric):
         for spec in load_links(path):
             for settings in (spec.forward, spec.reverse):
                 assert LinkSettings.model_validate_json(settings.model_dump_json()) == settings

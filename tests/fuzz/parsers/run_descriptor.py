@@ -7,17 +7,17 @@ from typing import Any
 from unittest.mock import patch
 
 from cosim.live.coordination import coordinator
-from noack.core.clock import RunClock
-from noack.core.errors import PeerError
+from netem.core.clock import RunClock
+from netem.core.errors import PeerError
+from netem.core.private_folder import open_private
+from netem.core.toml_file import json_schema
 from noack.protocol.roles import ROLES
 from noack.runtime import active_runs, run_descriptor
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
-from noack.runtime.private_folder import open_private
 from noack.scenario.parameter_changes import ChangeSchedule, settings_bytes, settings_of
 from noack.scenario.resolution import ResolvedRun
 from noack.scenario.runtime_parameters import SHORT
 from noack.scenario.scenario import Scenario
-from noack.scenario.toml_file import json_schema
 from tests.fuzz.edits import Choices, Vocabulary, damaged, edited, vocabulary
 from tests.fuzz.harness import refusal, workspace
 from tests.fuzz.plane import FakePlane, Query, Sample

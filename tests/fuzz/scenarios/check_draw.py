@@ -30,7 +30,7 @@ from cosim.live.finalize import finalize
 from cosim.record.run_directory import RunEnding
 from cosim.record.run_record import load_run
 from cosim.simulation.virtual_time import simulate_run
-from noack.core.errors import NoackError
+from netem.core.errors import NoackError
 from noack.scenario.resolution import loop_of, resolve, resolve_run, resolved_loops
 from noack.scenario.scenario import Scenario, loops_by_entry
 from noack.scenario.scenario_file import dumps, load

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import tomli_w
 
+from netem.core.toml_file import json_schema
 from noack.plants.linear import NAMED_MODELS
 from noack.references.segment import SolutionSegment
 from noack.scenario.scenario import Scenario
-from noack.scenario.toml_file import json_schema
 from tests.fuzz.scenarios.chances import Chances, Table
 from tests.fuzz.scenarios.loop_draws import Model, loop, setpoint, trigger
 from tests.fuzz.scenarios.network_draws import constraints, loss, network

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import loop_of

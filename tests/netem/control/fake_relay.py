@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.control.command_queue import CommandQueue
+from netem.core.address import Address
+from netem.core.core_library import core
+from netem.impairments.link_settings import Counters, LinkSettings
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport
 from netem.relay_watch import add_watching_options, check_watching_options
 from netem.tc_words import settings_of
-from noack.core.core_library import core
-from noack.impairments.link_settings import Counters, LinkSettings
-from noack.runtime.address import Address
 
 SETTINGS = settings_of("loss 10% delay 10ms mansd 2")
 HERE: Address = ("127.0.0.1", 5000)

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from netem.control.command_queue import CommandQueue
+from netem.core.errors import CallerError, PeerError
 from netem.tc_words import settings_of
-from noack.core.errors import CallerError, PeerError
 from tests.netem.control.fake_relay import FakeRelay
 
 

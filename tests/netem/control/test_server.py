@@ -18,9 +18,9 @@ from netem.control.command_queue import CommandQueue
 from netem.control.control_server import ControlServer
 from netem.control.emulator_commands import Client
 from netem.control.running_emulators import EMULATORS, find_emulator, registered_emulator, running_emulators
+from netem.control.zenoh_session import open_session
+from netem.core.errors import CallerError, ExitStatus
 from netem.tc_words import settings_of
-from noack.core.errors import CallerError, ExitStatus
-from noack.runtime.connections.zenoh_session import open_session
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.control.fake_relay import FakeRelay
 

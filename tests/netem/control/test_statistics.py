@@ -16,9 +16,9 @@ from netem.control.command_queue import AppliedSettings, Snapshot
 from netem.control.control_server import ControlServer
 from netem.control.emulator_statistics import DirectionStatistics, Statistics, rate_interval, statistics
 from netem.control.statistics_text import statistics_lines
+from netem.core.clock import NS_PER_S
+from netem.impairments.link_settings import Counters
 from netem.relay.relay_reports import FlowReport
-from noack.core.clock import NS_PER_S
-from noack.impairments.link_settings import Counters
 from tests.netem.control.fake_relay import FakeRelay, running
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from typing import Any
 
+from netem.core.address import Address
+from netem.core.udp_sockets import enlarge_buffer
+from netem.impairments.link_settings import LinkSettings
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import LinkReport
-from noack.impairments.link_settings import LinkSettings
-from noack.runtime.address import Address
-from noack.runtime.udp_sockets import enlarge_buffer
 
 PATIENCE_S = 60
 """Timeout for events that never happen; no test measures time with it."""

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
+from netem.core import udp_sockets
+from netem.core.address import address_text
+from netem.core.errors import CallerError
 from netem.relay import client_table
 from netem.relay.relay_reports import DirectionReport
 from netem.tc_words import settings_of
-from noack.core.errors import CallerError
-from noack.runtime import udp_sockets
-from noack.runtime.address import address_text
 from tests.netem.relay.relays import HOSTS, Received, drain, endpoints, link, name_of, relayed, running
 
 IP_VERSIONS = pytest.mark.parametrize(("here", "there"), [(4, 4), (4, 6), (6, 4), (6, 6)])

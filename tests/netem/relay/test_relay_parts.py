@@ -18,15 +18,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from netem.core.address import packed_name, unpacked_address
+from netem.core.core_library import core, ffi, pointer_to
+from netem.core.errors import CallerError
+from netem.impairments.link_settings import LinkSettings
 from netem.relay.link_sockets import socket_name
 from netem.relay.relay import Relay
 from netem.relay.relay_links import DeviceLink, LinkSpec, open_links
 from netem.relay.relay_memory import RelayMemory, name_array
 from netem.tc_words import settings_of
-from noack.core.core_library import core, ffi, pointer_to
-from noack.core.errors import CallerError
-from noack.impairments.link_settings import LinkSettings
-from noack.runtime.address import packed_name, unpacked_address
 from tests.netem.relay.relays import HOSTS, drain, endpoints, link, name_of, running
 
 

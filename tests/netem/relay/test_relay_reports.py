@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from netem.core.core_library import core
 from netem.relay.relay_reports import bucket_start_ns, coarse_histogram, quantile_ns
-from noack.core.core_library import core
 
 
 @given(st.integers(0, 2**44 - 1))

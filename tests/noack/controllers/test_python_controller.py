@@ -17,8 +17,8 @@ from cosim.output.result_tables import Tone
 from cosim.output.run_verdict import verdict
 from cosim.record.run_record import RunRecord, load_record
 from cosim.simulation.virtual_time import simulate, simulate_run
+from netem.core.errors import CallerError, ExitStatus
 from noack.controllers.controller_settings import ControlModel
-from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 
-from noack.core.core_library import core, ffi
+from netem.core.core_library import core, ffi
 from noack.core.linear_systems import (
     Matrix,
     Propagator,

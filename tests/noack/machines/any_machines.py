@@ -9,19 +9,19 @@ import numpy as np
 from hypothesis import strategies as st
 
 from controller_node.controller import Controller
-from noack.controllers.controller_settings import ControlFailedError
-from noack.controllers.linear_feedback import LinearFeedback
-from noack.core.clock import NEVER_NS
-from noack.core.core_library import ffi, new_handle
-from noack.core.linear_systems import Matrix, Vector, norm, product
-from noack.core.periods import Period
-from noack.core.references import Reference, ReferenceSegment
-from noack.guarantee.loss_guarantee import (
+from netem.core.clock import NEVER_NS
+from netem.core.core_library import ffi, new_handle
+from netem.core.periods import Period
+from netem.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
     LossesInWindow,
     LossGuarantee,
 )
+from noack.controllers.controller_settings import ControlFailedError
+from noack.controllers.linear_feedback import LinearFeedback
+from noack.core.linear_systems import Matrix, Vector, norm, product
+from noack.core.references import Reference, ReferenceSegment
 from noack.machines.loop_machines import LoopMachines
 from noack.observers.kalman import KalmanSettings
 from noack.observers.luenberger import LuenbergerSettings

@@ -14,7 +14,7 @@ from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.align import align_tables, true_states
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.core.row_operations import row_norms
+from netem.core.row_operations import row_norms
 from noack.observers.observer_settings import observer_gain, unobservable_mode
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.estimation import assumed_model, steady_state, true_model

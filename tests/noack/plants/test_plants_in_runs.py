@@ -10,7 +10,7 @@ from cosim.analysis.replay import replay
 from cosim.live.finalize import finalize
 from cosim.record.run_record import load_record
 from cosim.simulation.virtual_time import simulate_run
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.scenario_file import load
 

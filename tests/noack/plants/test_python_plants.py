@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.plants.plant_settings import SystemFailedError
 from noack.plants.python_plant import PythonPlantSettings, PythonSystem
 from noack.settings.user_files import with_absolute_path

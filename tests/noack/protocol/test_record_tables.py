@@ -1,4 +1,4 @@
-from noack.core.packet_rows import NETEM_PACKET, PACKET_HEAD_BYTES
+from netem.core.packet_rows import NETEM_PACKET, PACKET_HEAD_BYTES
 from noack.protocol import wire_format
 from noack.protocol.record_tables import OWNER, SENSOR_ACKNOWLEDGEMENT, tables
 from noack.protocol.roles import LOOP_ROLES

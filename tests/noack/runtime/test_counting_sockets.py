@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.core.errors import CallerError, PeerError
+from netem.core.address import LOOPBACK, Address, address_text, family_of, parse_address, parse_destination
+from netem.core.errors import CallerError, PeerError
+from netem.core.udp_sockets import enlarge_buffer
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow
 from noack.runtime import counting_sockets
-from noack.runtime.address import LOOPBACK, Address, address_text, family_of, parse_address, parse_destination
 from noack.runtime.counting_sockets import DROPPED_IN_FLOOD, SourceCount, bind, open_beside
 from noack.runtime.drivers.live_driver import LoopSockets
-from noack.runtime.udp_sockets import enlarge_buffer
 from tests.noack.runtime.drivers.live_loops import Live, measurement, scenario
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from noack.core.errors import MachineError
+from netem.core.errors import MachineError
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, tables
 from noack.runtime import host_clocks
 from noack.runtime.control_messages import ClockError

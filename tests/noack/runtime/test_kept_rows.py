@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.core.errors import NoackError
+from netem.core.errors import NoackError
 from noack.runtime.kept_rows import KeptFile, KeptHead, read_kept
 
 HEAD = KeptHead(run="0001", process="sensor", secret="s")

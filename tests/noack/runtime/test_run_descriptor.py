@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from noack.core.errors import CallerError
-from noack.runtime.private_folder import private_folder
+from netem.core.errors import CallerError
+from netem.core.private_folder import private_folder
 from noack.runtime.run_descriptor import (
     descriptor_file,
     find_descriptor,

@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 
-from noack.core import file_access
-from noack.core.errors import CallerError, ExitStatus, MachineError
-from noack.runtime import private_folder
-from noack.runtime.command_line import Signals
-from noack.runtime.private_folder import open_private
+from netem.core import file_access, private_folder
+from netem.core.command_line import Signals
+from netem.core.errors import CallerError, ExitStatus, MachineError
+from netem.core.private_folder import open_private
 
 
 def test_a_second_signal_ends_the_process_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,7 +65,7 @@ TERM = (signal.SIGTERM, 143, "stopped on request (SIGTERM)")
     ("words", "ended"),
     [
         (["cosim.cli", "typer", "--version"], INT),
-        (["netem", "noack.core.system_processes", "--help"], INT),
+        (["netem", "netem.core.system_processes", "--help"], INT),
         (["noack.network_process", "netem.channel", "--help"], INT),
         (["plant_server", "noack.runtime.run_process", "--help"], TERM),
     ],

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.core.errors import MachineError, NoAnswerError
+from netem.core.errors import MachineError, NoAnswerError
 from noack.protocol.roles import Notice, Record
 from noack.runtime import telemetry
 from noack.runtime.spool import NOTICES, SpoolWriter, read_batches

@@ -6,14 +6,14 @@ import pytest
 from cosim.analysis.replay import replay
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
+from netem.core.settings_section import Table
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.loads import load_gains
 from noack.scenario.resolution import loop_of, resolve, resolve_run, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from noack.settings.section import Table
 from tests.helpers.shipped import resolved, shipped
 
 MASS: Table = {

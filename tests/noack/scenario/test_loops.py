@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.scenario.resolution import ResolvedRun, loop_of, resolve
 from noack.scenario.scenario import Scenario, loop_names, loops_of
 from noack.scenario.scenario_file import load, toml_text, validate

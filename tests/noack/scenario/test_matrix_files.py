@@ -11,7 +11,7 @@ from scipy.io import loadmat, savemat
 from scipy.linalg import expm
 from scipy.sparse import csc_matrix
 
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.scenario.matrix_files import controller_of, model_of, save_model
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario

@@ -9,7 +9,7 @@ import pytest
 
 import noack
 from cosim.analysis.scenario_certificates import quick_certificate
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.overload import refuse_overload
 from noack.scenario.resolution import resolve

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from noack.core.errors import CallerError
-from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from netem.core.errors import CallerError
+from netem.impairments.loss_models.bernoulli import BernoulliLoss
+from netem.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.protocol.record_tables import CHANGE_BYTES
 from noack.scenario.parameter_changes import (
     ChangeSchedule,

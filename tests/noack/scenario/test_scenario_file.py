@@ -14,9 +14,9 @@ import pytest
 import tomli_w
 
 from cosim.studies.campaign.campaign_file import load as load_campaign
+from netem.core import toml_file
+from netem.core.errors import CallerError
 from netem.links_file import load_links
-from noack.core.errors import CallerError
-from noack.scenario import toml_file
 from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario_file import dumps, load, put, validate, value_of
 from noack_check.files import MOST_LEVELS
@@ -179,9 +179,9 @@ def test_text_without_long_keys_is_checked_in_linear_time(part: str) -> None:
 LIMITED = """
 import resource, sys
 from pathlib import Path
-from noack.scenario.toml_file import read
+from netem.core.toml_file import read
 from tests.helpers.approved import compare_lines
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 usage = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 limit = usage + 64 * 2**20
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from netem.core.toml_file import json_schema
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import put, value_of
-from noack.scenario.toml_file import json_schema
 
 ROOT = Path(__file__).parents[3]
 SHIPPED = sorted((ROOT / "scenarios").glob("*.toml"))

@@ -7,10 +7,10 @@ from unittest.mock import Mock
 
 import pytest
 
+from netem.core import settings_section as section_module
+from netem.core.settings_section import ScenarioSection
 from netem.links_file import LinksFile
 from noack.scenario.scenario import Scenario
-from noack.settings import section as section_module
-from noack.settings.section import ScenarioSection
 
 
 def real_numbers(schema: Any) -> Iterator[Any]:

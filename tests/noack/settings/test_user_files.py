@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 import noack
-from noack.core.errors import CallerError
-from noack.settings.named_file import NamedFile
+from netem.core.errors import CallerError
+from netem.core.named_file import NamedFile
 
 
 def test_only_regular_files_are_read(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import pytest
 
 from cosim.analysis.certificates import certificates_of
 from cosim.analysis.claims.run_certificates import scheduled_certificates
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.theory.coverage import is_papers_loop, nonlinear_because, require_exact
 from tests.helpers.shipped import resolved, shipped
 

@@ -18,7 +18,7 @@ from cosim.record.run_scenario import write_scenario
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.exact_simulation import setting_of
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario import Scenario

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.record.rows import Rows
-from noack.core.clock import NS_PER_S
+from netem.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,

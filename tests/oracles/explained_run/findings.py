@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cosim.record.rows import Rows
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NEVER_NS, NS_PER_S
+from netem.core.clock import NEVER_NS, NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import loop_of

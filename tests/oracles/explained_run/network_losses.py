@@ -3,8 +3,8 @@
 import numpy as np
 
 from cosim.record.run_events import PacketOutcome, packet_outcomes
-from noack.impairments.constraints.at_most import AtMost
-from noack.impairments.constraints.recovery import Recovery
+from netem.impairments.constraints.at_most import AtMost
+from netem.impairments.constraints.recovery import Recovery
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.scenario.scenario import Scenario
 from tests.oracles.explained_run.findings import ExplainedLoop

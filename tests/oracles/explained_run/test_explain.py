@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate_loops
-from noack.core.packet_rows import Fate
+from netem.core.packet_rows import Fate
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.scenario.resolution import resolve_run
 from noack.theory.certificates.conditions import ideal_conditions

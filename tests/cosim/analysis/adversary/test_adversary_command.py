@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 from tests.helpers.command_line import invoke
 
 pytestmark = pytest.mark.usefixtures("no_searches")

@@ -16,7 +16,7 @@ from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.record.run_record import RunRecord
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate

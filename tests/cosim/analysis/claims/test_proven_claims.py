@@ -11,7 +11,7 @@ from cosim.analysis.summary.summary_model import Claim
 from cosim.analysis.witnesses import find_statement
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.core.number_format import at_most
+from netem.core.number_format import at_most
 from noack.protocol.record_tables import PLANT_STEP
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds

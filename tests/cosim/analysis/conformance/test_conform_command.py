@@ -15,7 +15,7 @@ from cosim.analysis.conformance.verdicts import (
     Transition,
     Unknown,
 )
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 from tests.helpers.command_line import invoke
 
 

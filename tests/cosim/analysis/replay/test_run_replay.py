@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from cosim.analysis.replay import replay
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.core.packet_rows import NETEM_PACKET
+from netem.core.packet_rows import NETEM_PACKET
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,

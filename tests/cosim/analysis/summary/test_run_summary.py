@@ -11,7 +11,7 @@ from cosim.analysis.summary.run_summary import in_flight, worst_loop
 from cosim.analysis.summary.summary_model import LoopSummary
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.core.packet_rows import NETEM_PACKET, NETEM_RELEASE
+from netem.core.packet_rows import NETEM_PACKET, NETEM_RELEASE
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, network_tables
 from tests.cosim.record.changed_records import changed
 from tests.helpers.shipped import resolved

@@ -22,7 +22,7 @@ from cosim.output.run_tables import key_numbers
 from cosim.output.terminal_writer import print_document
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.helpers.summaries import summary_of, with_values

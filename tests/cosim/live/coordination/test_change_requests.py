@@ -10,8 +10,8 @@ import pytest
 
 from cosim.live.coordination import change_requests
 from cosim.live.coordination.change_requests import ChangeRequests
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError
 from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario_file import load
 

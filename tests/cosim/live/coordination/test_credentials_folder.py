@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cosim.live.coordination.credentials_folder import MARK, credentials_folder
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 
 if sys.platform == "win32":
     pytest.skip("runs across hosts need Linux", allow_module_level=True)

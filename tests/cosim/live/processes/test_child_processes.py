@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from cosim.live.processes.child_processes import MODULES, ChildProcesses
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 from noack.protocol.roles import LOOP_ROLES
 from tests.helpers.waiting import wait_for
 

@@ -18,7 +18,7 @@ from cosim.record.rows import with_loop
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord
 from cosim.record.spool_conversion import finish_record
-from noack.core.errors import MachineError
+from netem.core.errors import MachineError
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import RunProgress, parse_message

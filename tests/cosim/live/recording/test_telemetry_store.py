@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cosim.live.recording.telemetry_store import TelemetryStore
-from noack.core.errors import MachineError, PeerError
+from netem.core.errors import MachineError, PeerError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.control_messages import ChannelCounters, ProcessReport
 from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_batches

@@ -21,7 +21,7 @@ from cosim.output.figures.figure_format import PHONE_IN, SCREEN_IN, requested_fi
 from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.figures.run_figures import Transmissions, draw_norms, draw_states, run_curves, run_figures
 from cosim.output.figures.timing_figures import later_than
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from tests.cosim.output.conftest import CASES
 
 T_S = np.arange(1.0, 5.0)

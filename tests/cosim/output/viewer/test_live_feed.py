@@ -16,7 +16,7 @@ from cosim.output.viewer.run_recording import ALL_ERRORS, ALL_SIZES, MAP, QUEUE,
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun
 from cosim.simulation.virtual_time import simulate_loops
-from noack.core.packet_rows import NETEM_PACKET, PACKET_HEAD_BYTES, Fate
+from netem.core.packet_rows import NETEM_PACKET, PACKET_HEAD_BYTES, Fate
 from noack.protocol.record_tables import tables
 from noack.protocol.roles import Notice
 from noack.protocol.wire_format import Encoder, Flow, Message

@@ -12,7 +12,7 @@ from cosim.output.viewer.pictures.phase_picture import PhasePicture
 from cosim.output.viewer.pictures.picture import WHO, Columns, Frames, Picture, panel
 from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
 from cosim.output.viewer.pictures.tanks_picture import TanksPicture
-from noack.core.packet_rows import Fate
+from netem.core.packet_rows import Fate
 
 S = 1_000_000_000
 PICTURES: dict[str, tuple[Picture, int, int]] = {

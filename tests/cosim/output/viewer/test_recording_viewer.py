@@ -19,7 +19,7 @@ import rerun.experimental
 from cosim.output.viewer.pictures.picture import TIMELINE
 from cosim.output.viewer.recording_viewer import RECORDING, LiveView
 from cosim.output.viewer.rerun_program import move_window_to
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 from tests.cosim.output.viewer.recordings import add_samples, another_process, new_view
 from tests.helpers.live_runs import noack_command
 from tests.helpers.waiting import is_left, wait_for

@@ -14,7 +14,7 @@ from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environm
 from cosim.record.run_record import RunRecord
 from cosim.record.run_scenario import write_scenario
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import ExitStatus
+from netem.core.errors import ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import ResolvedRun
 from tests.cosim.output.viewer.recordings import read, series

@@ -10,7 +10,7 @@ import pytest
 
 from cosim.studies.campaign.campaign_file import json_schema, load
 from cosim.studies.campaign.campaign_grid import grid
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from tests.cosim.studies.campaign.conftest import Write, few_of
 from tests.helpers.approved import compare_lines, lines_of_error
 

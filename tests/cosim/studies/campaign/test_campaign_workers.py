@@ -16,7 +16,7 @@ from cosim.studies.campaign import campaign_workers
 from cosim.studies.campaign.arithmetic import arithmetic
 from cosim.studies.campaign.campaign_workers import LostWorkersError, cluster_runner, run_in_process
 from cosim.studies.campaign.chunk_store import Store, run_campaign
-from noack.core.errors import CallerError, PeerError
+from netem.core.errors import CallerError, PeerError
 from tests.cosim.studies.campaign.conftest import Command, Write, few_of
 from tests.helpers.campaign_files import files
 from tests.helpers.live_runs import command_of

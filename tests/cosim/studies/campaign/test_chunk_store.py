@@ -14,8 +14,8 @@ import pytest
 from cosim.studies.campaign.campaign_grid import base_of
 from cosim.studies.campaign.campaign_workers import run_in_process
 from cosim.studies.campaign.chunk_store import Chunk, Store, locked_folder, run_campaign
-from noack.core import file_access
-from noack.core.errors import CallerError, MachineError
+from netem.core import file_access
+from netem.core.errors import CallerError, MachineError
 from tests.cosim.studies.campaign.conftest import Few, Write, few_of
 from tests.helpers.campaign_files import files
 

@@ -18,9 +18,9 @@ from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.campaign_grid import row_type
 from cosim.studies.campaign.drawn_runs import LOOPS_ROW, SampledWork, SharedNetworkWork, in_virtual_time
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario, seeds_of
-from noack.core.errors import CallerError, ExitStatus
-from noack.impairments.kinds.replay import Replay
-from noack.impairments.loss_models.lossless import NoLoss
+from netem.core.errors import CallerError, ExitStatus
+from netem.impairments.kinds.replay import Replay
+from netem.impairments.loss_models.lossless import NoLoss
 from noack.machines.run_channel import channel_of
 from noack.scenario.resolution import ResolvedRun, loop_of
 from noack.scenario.scenario import Scenario

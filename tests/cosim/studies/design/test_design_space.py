@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import solve_continuous_lyapunov
 
 from cosim.studies.design.design_space import weighed_gain
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
 from noack.plants.linear import lane_following
 

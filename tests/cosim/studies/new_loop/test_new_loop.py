@@ -13,7 +13,7 @@ import noack
 from cosim.analysis.certificates import Certificates
 from cosim.studies.new_loop.linear_model import controllable_states
 from cosim.studies.new_loop.new_scenario import _Trial, _TrialScenarios
-from noack.core.errors import CallerError
+from netem.core.errors import CallerError
 from noack.plants.systems import linearisation
 from noack.scenario.outputs import LoopOutput
 from noack.scenario.resolution import loop_of, resolve

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from noack.core.errors import CallerError, PeerError
+from netem.core.errors import CallerError, PeerError
 from noack.runtime.connections.credentials import own_host, read_credentials
 from tests.helpers.run_descriptors import RUN_DESCRIPTOR
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from controller_node.controller import controllers_of
-from noack.core.clock import RunClock
+from netem.core.clock import RunClock
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.roles import SENDS, Notice, Record
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from noack.core.clock import RunClock
+from netem.core.clock import RunClock
 from noack.protocol.roles import Notice, Record
 from noack.runtime.drivers import real_time_loop
 from noack.runtime.drivers.real_time_loop import RecordSink, run_loop

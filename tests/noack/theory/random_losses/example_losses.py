@@ -3,9 +3,9 @@
 import numpy as np
 
 import noack
-from noack.guarantee.loss_guarantee import LossGuarantee
-from noack.impairments.loss_prediction import LossProcess, OutcomeChain
-from noack.impairments.markov_chain import Array
+from netem.guarantee.loss_guarantee import LossGuarantee
+from netem.impairments.loss_prediction import LossProcess, OutcomeChain
+from netem.impairments.markov_chain import Array
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.random_losses import mean_square_growth as mean_square_module

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
+from netem.guarantee.loss_guarantee import LossGuarantee
+from netem.impairments.constraints import join_guarantee
+from netem.impairments.target_loss import loss_process
 from noack.core.linear_systems import Matrix
-from noack.guarantee.loss_guarantee import LossGuarantee
-from noack.impairments.constraints import join_guarantee
-from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of
 from noack.theory.random_losses.exact_moments import (
     LoopMoments,

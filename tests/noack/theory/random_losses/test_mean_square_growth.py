@@ -5,8 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from noack.impairments.loss_prediction import LossProcess, OutcomeChain
-from noack.impairments.markov_chain import Array, NotPredictableError
+from netem.impairments.loss_prediction import LossProcess, OutcomeChain
+from netem.impairments.markov_chain import Array, NotPredictableError
 from noack.theory.random_losses.mean_square_growth import PeriodMaps
 from noack.theory.time_triggered.exact_matrices import IntervalMatrix
 from tests.noack.theory.random_losses.example_losses import BURSTY, independent, mean_square_growth, unlimited

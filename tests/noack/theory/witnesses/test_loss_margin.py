@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
-from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
+from netem.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.proof.period_document import PeriodDocument
 from noack.proof.period_graph import PeriodGraph, float_rows
 from noack.scenario.scenario import Scenario

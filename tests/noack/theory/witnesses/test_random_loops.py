@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import expm, solve_continuous_are
 
 from cosim.cli.options import find_scenario
+from netem.guarantee.loss_guarantee import LossHistory
 from noack.core.linear_systems import Matrix
-from noack.guarantee.loss_guarantee import LossHistory
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.theory.witnesses.loss_margin import LossMargin
