@@ -1,13 +1,7 @@
-"""Measures a network: its losses and delays, the M that it has, and models that fit it.
+"""What a measured network (:mod:`netem.measurement`) means for a scenario, and the page about it.
 
-From a packet trace to the outputs, in this order:
-
-1. ``trace_sources.py`` reads a trace from files.
-2. ``loss_bursts.py``: which packets are effective, the bursts of consecutive losses, and M.
-3. ``chain_fits.py``: loss models that fit the bursts, with confidence intervals of
-   ``interval_estimates.py``; ``outages.py``: bursts that are too long for them.
-4. ``certificate_time.py``: when a scenario's certificate would have been void.
-5. ``network_measurement.py``: all of this as one object.
-6. ``measurement_outputs.py``: tables, figures, page and JSON; ``network_section.py``: a
+1. ``run_trace.py``: the packet trace of a run.
+2. ``certificate_time.py``: when a scenario's certificate would have been void.
+3. ``measurement_outputs.py``: tables, figures, page and JSON; ``network_section.py``: a
    ``[network]`` section that reproduces the network.
 """

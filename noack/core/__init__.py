@@ -1,7 +1,5 @@
-"""What all of noack is based on, without knowledge of loops.
+"""What the loop is based on, above :mod:`netem.core`, without knowledge of scenarios.
 
-``core_library.py`` is the library in C, on which ``linear_systems.py`` and ``random_streams.py``
-rest; ``row_operations.py`` has fast operations on many short rows; ``clock.py`` is a run's time.
-``errors.py``, ``file_access.py``, ``system_processes.py``, ``number_format.py`` and
-``cached_method.py`` have no mathematics.
+``linear_systems.py`` and ``pole_placement.py`` have matrices, ``references.py`` set points over time;
+``cached_method.py`` and ``progress.py`` have no mathematics.
 """

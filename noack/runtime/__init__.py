@@ -2,13 +2,13 @@
 
 Read ``join_run.py`` first, then ``run_process.py`` from top to bottom. They use, in this order:
 
-* ``command_line.py`` and ``run_descriptor.py``, with which a process starts,
+* ``run_descriptor.py``, with which a process starts,
 * ``control_plane.py`` and its messages (``control_messages.py``), over sessions of ``connections``
   (the start barrier is held and opened by the coordinator, in ``cosim/live/coordination``); on another
   host ``host_clocks``, too,
-* ``udp_sockets.py`` with ``address.py``,
+* ``counting_sockets.py``,
 * ``drivers``, with the real-time loop,
-* ``telemetry.py`` and ``spool.py`` for the rows; ``private_folder.py`` for files of the user.
+* ``telemetry.py`` and ``spool.py`` for the rows.
 
 Other programs of the user find a run and change its settings by ``active_runs.py``.
 """

@@ -1,5 +1,5 @@
-"""The parts of settings.
+"""The parts of a loop's settings, above :mod:`netem.core.settings_section`.
 
-``section.py`` has tables, kinds, vectors and matrices, ``user_files.py`` the files and classes that a
+``values.py`` has names, rates, vectors and matrices, ``user_files.py`` the files and classes that a
 table names.
 """

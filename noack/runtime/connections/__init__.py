@@ -1,5 +1,5 @@
-"""Connections of a process with other programs of noack.
+"""Connections of a process with a run on another host.
 
-``zenoh_session.py`` opens sessions of zenoh on a Unix socket, or with another host by TLS;
-``credentials.py`` has what a process on another host needs for that.
+``credentials.py`` has what a process needs for a session of zenoh by TLS
+(:mod:`netem.control.zenoh_session`).
 """
