@@ -237,7 +237,7 @@ core: $(VENV)/.dependencies
 $(VENV)/.installed: $(VENV)/.dependencies pyproject.toml | core
 	@$(SAY) --late "installing noack" $(EDITABLE)
 	@# Else each process compiles its modules anew where PYTHONDONTWRITEBYTECODE is set.
-	@$(SAY) --late "compiling modules" $(BIN)/python -m compileall -q -j 0 noack checker/noack_check netem cosim plant_server sensor_node controller_node
+	@$(SAY) --late "compiling modules" $(BIN)/python -m compileall -q -j 0 noack netem cosim plant_server sensor_node controller_node
 	@touch $@
 
 $(VENV)/.installed-lab: requirements-lab.lock $(VENV)/.installed

@@ -33,12 +33,12 @@ from netem.impairments.kinds import IMPAIRMENTS
 from netem.impairments.loss_models import LOSS_MODELS
 from netem.tc_words import KEYWORDS
 from noack.controllers.controller_settings import ControllerSettings
+from noack.proof.elaborate.keys import key_table
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES, AnyDisturbance, AnyObserver
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions
-from noack_check.keys import key_table
 from tests.helpers.pages import PAGES, ROOT, blocks
 from tests.helpers.shipped import resolved
 

@@ -28,6 +28,7 @@ from netem.core.clock import NS_PER_S
 from netem.core.core_library import core, ffi
 from netem.core.realtime_settings import realtime
 from noack.core.linear_systems import Vector
+from noack.proof.elaborate.scenario import read_loop
 from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import ResolvedRun, resolve
@@ -35,7 +36,6 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
 from noack.scenario.sections import PLANTS, POLICIES
 from noack.theory.witnesses.documents import witness_by_gains
-from noack_check.scenario import read_loop
 from plant_server.plant import plants_of
 
 Method = Literal["RK45", "DOP853"]

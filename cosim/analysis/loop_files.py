@@ -2,12 +2,12 @@
 
 from cosim.analysis.witnesses import WitnessedStatement, Witnesses
 from netem.core.errors import CallerError
+from noack.proof.elaborate.loop import Loop
 from noack.proof.files import ProofFiles, proof_files
 from noack.proof.gains_document import GainsFiles, gains_files
 from noack.proof.loop_document import Naming, NoDocumentError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack_check.loop import Loop
 
 _PLANTS = {"own": "the plant", "box": "all plants of its uncertainty", "region": "the plant's equations"}
 _CONDITIONS = {"schedule": "its schedule", "ideal": "ideal conditions"}

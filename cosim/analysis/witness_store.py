@@ -19,7 +19,7 @@ from typing import NamedTuple
 from flint import arb, arb_mat
 
 from netem.core.file_access import create_folder, new_file, open_regular, remove_file
-from noack_check.loop import Loop
+from noack.proof.elaborate.loop import Loop
 
 SHIPPED, INDEX = Path(__file__).parent / "shipped_proofs", "index.json"
 """Proofs of the package, and the file that has their names by the loop's key."""

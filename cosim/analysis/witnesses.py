@@ -1,7 +1,6 @@
-"""Bounds of a scenario that the checker has proven, with their witnesses.
+"""Bounds of a scenario that the kernel, or the checker of gains, has proven, with their witnesses.
 
-The search takes some seconds to minutes; what it finds is verified by :mod:`noack_check`, which derives
-the loop from the resolved scenario itself.
+The search takes some seconds to minutes. What it finds becomes a document and a proof (:mod:`noack.proof`).
 """
 
 import hashlib
@@ -17,7 +16,14 @@ from flint import fmpq
 from cosim.analysis.witness_store import StoredSearch, WitnessStore
 from noack.core.linear_systems import Vector
 from noack.core.progress import Progress, no_progress, part_of
+from noack.plants.systems.equation_text import equation_lines
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations, trace
+from noack.proof.elaborate.errors import RefusedError, RejectedError
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.scenario import Enclosed as EnclosedPlant
+from noack.proof.elaborate.scenario import read_loop, read_region
+from noack.proof.elaborate.tables import read_table
+from noack.proof.search.results import Proof
 from noack.proof.statement_proof import prove_statement
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
@@ -34,14 +40,6 @@ from noack.theory.witnesses.regions import (
     region_table,
     region_witness_by_gains,
 )
-from noack_check.check import RejectedError
-from noack_check.document import read_table
-from noack_check.equation_text import equation_lines
-from noack_check.keys import RefusedError
-from noack_check.loop import Loop
-from noack_check.proof import Proof
-from noack_check.scenario import Enclosed as EnclosedPlant
-from noack_check.scenario import read_loop, read_region
 
 _T = TypeVar("_T")
 _MOST_KEPT = 300

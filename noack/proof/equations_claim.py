@@ -11,11 +11,11 @@ from typing import Any, TypeAlias
 
 from flint import arb, arb_mat, fmpq
 
+from noack.core.balls import identity
+from noack.plants.systems.equation_text import equation_lines
+from noack.proof.elaborate.loop import Loop
 from noack.proof.loop_document import LoopDocument, NoDocumentError, Table
 from noack.proof.numbers import above, below, quotient, to_fraction
-from noack_check.balls import identity
-from noack_check.equation_text import equation_lines
-from noack_check.loop import Loop
 from noack_equations import LinearPlants, Region, RejectedError, enclose
 
 Interval: TypeAlias = tuple[Fraction, Fraction]

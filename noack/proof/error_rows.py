@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from flint import arb, arb_mat
 
+from noack.core.balls import number
+from noack.proof.elaborate.hybrid_system import thresholds
+from noack.proof.elaborate.norms import growth
 from noack.proof.event_times import Levels
 from noack.proof.loop_document import BOUND_OF_E, BOUND_OF_W, DRIFT, ERROR, LoopDocument, Table
 from noack.proof.numbers import Fractions, as_written, quotient, written
 from noack.proof.quiet_start import NAME as QUIET
 from noack.proof.quiet_start import QuietStart
-from noack_check.balls import number
-from noack_check.model import thresholds
-from noack_check.norms import growth
-from noack_check.proof import weighted
+from noack.proof.search.results import weighted
 
 _ROOM = 1 + 1e-6
 """Numbers are larger by this factor than computed in floating point."""

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from flint import arb, arb_mat
 
+from noack.core.balls import number
+from noack.proof.elaborate.norms import growth
 from noack.proof.loop_document import DRIFT, LoopDocument, Table
 from noack.proof.numbers import as_written, quotient
-from noack_check.balls import number
-from noack_check.norms import growth
 
 _ROOM = 1 + 1e-5
 """Numbers are larger by this factor than computed in floating point."""

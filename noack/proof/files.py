@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.tables import read_number
 from noack.proof.equations_claim import add_claim
 from noack.proof.forms_proof import as_text, write_proof
 from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
+from noack.proof.search.results import compares_error, read_assumptions
 from noack.proof.words import in_words
-from noack_check.document import read_number
-from noack_check.loop import Loop
-from noack_check.proof import compares_error, read_assumptions
 from noack_kernel import Proven, prove
 
 

@@ -8,14 +8,14 @@ from typing import Any
 
 from flint import arb
 
+from noack.core.balls import is_zero
+from noack.proof.elaborate.hybrid_system import Edge, Signal
 from noack.proof.error_rows import ErrorRows
 from noack.proof.event_times import EventTimes, levels_of
 from noack.proof.loop_document import DRIFT, ERROR, ETA, LoopDocument, Table
 from noack.proof.numbers import as_written, quotient, simplest
 from noack.proof.quiet_start import write_quiet_start
-from noack_check.balls import is_zero
-from noack_check.model import Edge, Signal
-from noack_check.proof import compares_error
+from noack.proof.search.results import compares_error
 
 FORMAT = "noack-forms 1"
 

@@ -11,14 +11,14 @@ from typing import Any
 
 from flint import arb, arb_mat
 
+from noack.core.balls import rows_of
+from noack.proof.elaborate.errors import RejectedError as NoNoiseBoundError
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.noise import noise_of
 from noack.proof.equations_claim import add_claim_of_gains
 from noack.proof.forms_proof import as_text
 from noack.proof.loop_document import Naming, NoDocumentError, Table
 from noack.proof.numbers import exact, least_above, matrix, quotient, to_fraction
-from noack_check.balls import rows_of
-from noack_check.check import RejectedError as NoNoiseBoundError
-from noack_check.loop import Loop
-from noack_check.noise import noise_of
 from noack_gains import Document, Proven, RejectedError, in_words, prove
 
 LOOP_FORMAT, PROOF_FORMAT = "noack-gains-loop 1", "noack-gains 1"

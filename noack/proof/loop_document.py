@@ -1,7 +1,7 @@
 """The loop document of a loop: coordinates, facts, motions, locations and edges, as the kernel reads them.
 
 A document says nothing of a trigger or a network: losses are locations, deliveries are edges, a threshold is
-a fact. It has the form of ``noack_check.model``, in which the search finds its proofs.
+a fact. It has the form of ``noack.proof.elaborate.hybrid_system``, in which the search finds its proofs.
 """
 
 import itertools
@@ -14,7 +14,10 @@ from typing import Any
 import numpy as np
 from flint import arb, arb_mat, fmpq
 
+from noack.core.balls import columns_of, identity, is_zero, rows_of
 from noack.core.linear_systems import Matrix
+from noack.proof.elaborate.hybrid_system import Edge, Flow, Location, Model, Unknown
+from noack.proof.elaborate.loop import Loop
 from noack.proof.numbers import (
     Fractions,
     Number,
@@ -29,10 +32,7 @@ from noack.proof.numbers import (
     to_fraction,
     written,
 )
-from noack_check.balls import columns_of, identity, is_zero, rows_of
-from noack_check.loop import Loop
-from noack_check.model import Edge, Flow, Location, Model, Unknown
-from noack_check.proof import Assumptions, compares_error, last_test_before
+from noack.proof.search.results import Assumptions, compares_error, last_test_before
 
 FORMAT = "noack-hybrid 1"
 Table = dict[str, Any]

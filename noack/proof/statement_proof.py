@@ -4,15 +4,15 @@ from collections.abc import Mapping
 
 from flint import arb, fmpq
 
+from noack.core.balls import identity, rows_of
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.norms import spectral_norm
+from noack.proof.elaborate.tables import read_number
 from noack.proof.files import proof_files
 from noack.proof.gains_document import gains_files
 from noack.proof.loop_document import Naming, NoDocumentError
-from noack_check.balls import identity, rows_of
-from noack_check.check import RejectedError
-from noack_check.document import read_number
-from noack_check.loop import Loop
-from noack_check.norms import spectral_norm
-from noack_check.proof import (
+from noack.proof.search.results import (
     Assumptions,
     Bound,
     Proof,
@@ -20,8 +20,9 @@ from noack_check.proof import (
     last_test_before,
     read_assumptions,
     read_entry,
+    size,
+    smallest_bounds,
 )
-from noack_check.sentences import size, smallest_bounds
 from noack_gains import RejectedError as RejectedGainsError
 from noack_kernel import Proven
 from noack_kernel import RejectedError as RejectedByKernelError

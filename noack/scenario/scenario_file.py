@@ -22,6 +22,7 @@ from netem.core.named_file import NamedFile
 from netem.core.settings_section import ReadTable, ScenarioSection, Table
 from netem.core.toml_file import keys as known_keys
 from netem.core.toml_file import nearest_key
+from netem.core.toml_limits import MOST_LEVELS
 from noack.references.file import FilePiece
 from noack.scenario.integrals import with_integrals
 from noack.scenario.matrix_files import with_matrices
@@ -32,7 +33,6 @@ from noack.scenario.scenario_checks import check_reference, check_target_loss
 from noack.scenario.sections import DirectionSection, NetworkSection
 from noack.scenario.symbols import SYMBOLS
 from noack.settings.user_files import file_tables, with_absolute_path, with_tables
-from noack_check.files import MOST_LEVELS
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")

@@ -9,9 +9,9 @@
 5. ``random_losses``: what holds if nothing limits the number of consecutive losses.
 
 ``coverage.py`` says which loops the paper's identities, exact simulation and mean costs cover; what proofs
-cover is in ``checker/noack_check/keys.toml``. ``response_bounds.py`` encloses responses of linear systems.
+cover is in ``noack/proof/elaborate/keys.toml``. ``response_bounds.py`` encloses responses of linear systems.
 
-Each bound of a certificate was verified by :mod:`noack_check`, whose modules have the argument. Labels such
-as eq:LossEv3 are those of the paper's source. docs/theory.md states the results, docs/derivations.md has the
+Each bound of a certificate was verified by a program of ``checker/``, which has the rules. Labels such as
+eq:LossEv3 are those of the paper's source. docs/theory.md states the results, docs/derivations.md has the
 proofs and a table of the files.
 """

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_continuous_lyapunov
 
+from noack.core.balls import matrix, number
 from noack.core.linear_systems import Matrix
-from noack_check.balls import matrix, number
 from noack_gains import RejectedError
 from noack_gains.responses import Decay, responses
 

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from flint import fmpq
 
+from noack.core.balls import number
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.loop import Loop
+from noack.proof.search.results import Proof
 from noack.proof.statement_proof import prove_statement
-from noack_check.balls import number
-from noack_check.check import RejectedError
-from noack_check.loop import Loop
-from noack_check.proof import Proof
 
 Document = dict[str, Any]
 Rng = np.random.Generator

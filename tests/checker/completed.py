@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from noack_check.balls import number
-from noack_check.loop import Loop
-from noack_check.model import Model
-from noack_check.proof import read_assumptions
+from noack.core.balls import number
+from noack.proof.elaborate.hybrid_system import Model
+from noack.proof.elaborate.loop import Loop
+from noack.proof.search.results import read_assumptions
 
 
 def completed(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from noack_check.loop import Loop
+from noack.proof.elaborate.loop import Loop
 from tests.checker.runs import floats
 
 Array = NDArray[np.float64]

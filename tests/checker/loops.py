@@ -13,11 +13,11 @@ import numpy as np
 from flint import arb, fmpq
 from scipy.linalg import expm
 
+from noack.core.balls import beside, identity, matrix, number, zeros
 from noack.observers.observer_settings import observer_gain
-from noack_check.balls import beside, identity, matrix, number, zeros
-from noack_check.loop import Loop, Observer, Rule, Times
-from noack_check.proof import Proof
-from noack_check.scenario import _squares, read_loop
+from noack.proof.elaborate.loop import Loop, Observer, Rule, Times
+from noack.proof.elaborate.scenario import _squares, read_loop
+from noack.proof.search.results import Proof
 from tests.checker.runs import floats
 from tests.helpers.resolved_tables import resolved_tables
 

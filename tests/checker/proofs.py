@@ -17,17 +17,18 @@ from flint import arb, fmpq
 
 from cosim.analysis.witness_store import WitnessStore
 from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
+from noack.core.balls import matrix
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.scenario import Enclosed, read_loop, read_region
+from noack.proof.elaborate.times import Schedule
 from noack.proof.gains_document import gains_files
 from noack.proof.loop_document import Naming
+from noack.proof.search.results import Proof
 from noack.proof.statement_proof import prove_statement
 from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.witnesses.documents import Witness, find_witness, witness_by_gains
 from noack.theory.witnesses.outward import proven_bounds
-from noack_check.balls import matrix
-from noack_check.loop import Loop
-from noack_check.proof import Proof
-from noack_check.scenario import read_enclosed, read_loop
-from noack_check.times import Schedule
+from noack_equations import enclose
 from noack_gains import Document as GainsDocument
 from noack_gains import Gains, read_proof
 from tests.checker.loops import (
@@ -101,6 +102,13 @@ class OfLoop:
         return self.loop()
 
 
+def enclosed_equations(resolved: Mapping[str, Any], document: Mapping[str, Any]) -> Enclosed:
+    """Return the equations of a search's document, enclosed over its region."""
+    B = resolved["model"]["B"]
+    region = read_region(document, len(B), len(B[0]))
+    return Enclosed(enclose(document["equations"], region), region)
+
+
 @dataclass(frozen=True)
 class OfScenario:
     """The proof of a statement about a shipped scenario: its plants and conditions."""
@@ -122,7 +130,7 @@ class OfScenario:
     def loop_of(self, document: Mapping[str, object]) -> Loop:
         """Return the loop, on the region of the document if it has one."""
         content = resolved_content(resolved(self.name, *self.settings))
-        enclosed = read_enclosed(content, document) if self.plants == "region" else None
+        enclosed = enclosed_equations(content, document) if self.plants == "region" else None
         is_ideal = self.conditions == "ideal"
         return read_loop(
             content, box=self.plants == "box", ideal=is_ideal, enclosed=enclosed, longer=self.longer

@@ -2,12 +2,12 @@
 
 from flint import arb
 
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.noise import noise_of
 from noack.proof.forms_proof import FORMAT, as_text
 from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
 from noack.proof.quiet_start import write_quiet_start
-from noack_check.loop import Loop
-from noack_check.noise import noise_of
-from noack_check.proof import MOST_LATER, Assumptions
+from noack.proof.search.results import MOST_LATER, Assumptions
 from noack_kernel import RejectedError, prove
 
 

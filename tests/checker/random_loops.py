@@ -6,8 +6,8 @@ import numpy as np
 from flint import arb, fmpq
 from scipy.linalg import solve_continuous_are
 
-from noack_check.balls import beside, identity, matrix, number, zeros
-from noack_check.loop import Loop, Rule, Times
+from noack.core.balls import beside, identity, matrix, number, zeros
+from noack.proof.elaborate.loop import Loop, Rule, Times
 
 
 def _periodic(rng: np.random.Generator) -> Loop:

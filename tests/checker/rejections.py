@@ -5,11 +5,12 @@ from typing import Any
 
 import pytest
 
+from noack.core.balls import is_positive, matrix, number
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.hybrid_system import Model
+from noack.proof.elaborate.loop import Loop
+from noack.proof.search.exact_test import _value
 from noack.proof.statement_proof import prove_statement
-from noack_check.balls import is_positive, matrix, number
-from noack_check.check import RejectedError, _value
-from noack_check.loop import Loop
-from noack_check.model import Model
 
 
 def rejects(loop: Loop, document: object, match: str) -> None:

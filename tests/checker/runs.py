@@ -13,9 +13,9 @@ from flint import fmpq
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from noack_check.balls import number
-from noack_check.loop import Loop
-from noack_check.proof import Proof
+from noack.core.balls import number
+from noack.proof.elaborate.loop import Loop
+from noack.proof.search.results import Proof
 
 Array = NDArray[np.float64]
 _ROUNDING = 1e-9

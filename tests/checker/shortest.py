@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from noack_check.loop import Loop
+from noack.proof.elaborate.loop import Loop
 from tests.checker.runs import floats
 
 STEP_S = 1e-3

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
+from noack.proof.elaborate.errors import RefusedError
+from noack.proof.elaborate.scenario import read_linear_loop, read_loop
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
 from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.witnesses.documents import witness_by_gains
 from noack.theory.witnesses.effort import NoWitnessError
 from noack.theory.witnesses.outward import proven_bounds
-from noack_check.keys import RefusedError
-from noack_check.scenario import read_linear_loop, read_loop
 from tests.helpers.bound_shares import share_of_bound
 from tests.helpers.resolved_tables import resolved_tables
 from tests.helpers.shipped import shipped

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from flint import fmpq
 
+from noack.core.balls import beside, identity, matrix, number, square, zeros
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.loop import Loop
+from noack.proof.search.results import Proof
 from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.documents import witness_by_gains
-from noack_check.balls import beside, identity, matrix, number, square, zeros
-from noack_check.check import RejectedError
-from noack_check.loop import Loop
-from noack_check.proof import Proof
 from noack_gains.apart import _sum_of_vectors, reached, share_of_threshold
 from tests.checker.loops import IDEAL, NOISE, SCHEDULE, changed, scalar, steady
 from tests.checker.proofs import gains_of

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
+from noack.core.balls import identity, number
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.hybrid_system import Errors, Model
 from noack.proof.statement_proof import prove_statement
-from noack_check.balls import identity, number
-from noack_check.check import RejectedError
-from noack_check.model import Errors, Model
 from tests.checker.completed import completed
 from tests.checker.loops import bounds_of, changed, double_integrator
 from tests.checker.proofs import Proved, proved

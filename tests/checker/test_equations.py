@@ -11,11 +11,11 @@ from flint import arb
 from cosim.analysis.loop_files import loop_files
 from cosim.analysis.witnesses import find_statement
 from noack.plants.systems.traced_equations import NotEnclosedError, trace
+from noack.proof.elaborate.loop import Region
 from noack.proof.equations_claim import equations_text
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.witnesses.coordinates import floats
-from noack_check.loop import Region
 from noack_equations import RejectedError as RejectedEquationsError
 from noack_equations import enclose, prove_equations
 from noack_kernel import RejectedError as RejectedByKernelError

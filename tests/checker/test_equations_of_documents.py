@@ -14,11 +14,11 @@ from flint import arb
 
 from cosim.analysis.loop_files import loop_files
 from cosim.analysis.witnesses import WitnessedStatement, find_witnesses
+from noack.plants.systems.equation_text import equation_lines
 from noack.plants.systems.traced_equations import trace
 from noack.proof.equations_claim import equations_text
 from noack.proof.gains_document import gains_files
 from noack.proof.loop_document import Naming
-from noack_check.equation_text import equation_lines
 from noack_equations import Region, RejectedError, claimed_digest, enclose, prove_equations
 from noack_equations.text import block_of, digest_of, steps_of
 from noack_gains import prove as prove_by_gains

@@ -32,14 +32,14 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
+from noack.core.balls import identity, matrix, number, zeros
+from noack.proof.elaborate.errors import RefusedError
+from noack.proof.elaborate.loop import Loop, Rule
+from noack.proof.elaborate.scenario import _checked
 from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
+from noack.proof.search.results import Assumptions
 from noack.proof.statement_proof import prove_by_forms
 from noack.theory.witnesses.assumptions import inter_event_s
-from noack_check.balls import identity, matrix, number, zeros
-from noack_check.keys import RefusedError
-from noack_check.loop import Loop, Rule
-from noack_check.proof import Assumptions
-from noack_check.scenario import _checked
 from tests.checker.completed import completed
 from tests.checker.loops import (
     IDEAL,

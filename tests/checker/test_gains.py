@@ -12,16 +12,15 @@ import pytest
 from flint import arb, fmpq
 from scipy.linalg import expm
 
+from noack.core.balls import beside, identity, matrix, number, zeros
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.loop import Loop, Memory
+from noack.proof.elaborate.times import Schedule
+from noack.proof.search.results import Proof, smallest_bounds
 from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.documents import witness_by_gains
 from noack.theory.witnesses.effort import NoWitnessError
 from noack.theory.witnesses.gains import _lyapunov
-from noack_check.balls import beside, identity, matrix, number, zeros
-from noack_check.check import RejectedError
-from noack_check.loop import Loop, Memory
-from noack_check.proof import Proof
-from noack_check.sentences import smallest_bounds
-from noack_check.times import Schedule
 from noack_gains.reading import RejectedError as RejectedGainsError
 from noack_gains.responses import Decay, responses, responses_until
 from tests.checker.loops import AREA, DUE, IDEAL, SCHEDULE, changed, double_integrator, scalar, with_form

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from flint import arb, fmpq
 
+from noack.core.balls import identity, matrix, number
+from noack.proof.elaborate.loop import Loop
 from noack.proof.gains_document import gains_files
 from noack.proof.loop_document import Naming
-from noack_check.balls import identity, matrix, number
-from noack_check.loop import Loop
 from noack_gains import Document, Proven, RejectedError, in_words, prove
 from tests.checker.loops import DUE, SCHEDULE, double_integrator, pushed, scalar, with_form
 from tests.checker.proofs import by_gains

@@ -12,15 +12,14 @@ import pytest
 
 from cosim.analysis.witnesses import resolved_content
 from noack.core.linear_systems import Matrix
+from noack.proof.elaborate.errors import RefusedError, RejectedError
 from noack.proof.period_times import LoopTimes
+from noack.proof.search.growth import PeriodicLoop, prove_growth, read_periodic_loop
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.time_triggered.time_triggered_loop import TimeTriggeredLoop
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.growth import enclose_growth
-from noack_check.check import RejectedError
-from noack_check.growth import PeriodicLoop, prove_growth, read_periodic_loop
-from noack_check.keys import RefusedError
 from noack_kernel.__main__ import verify
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import shipped

@@ -11,18 +11,17 @@ from cosim.analysis.witnesses import WitnessedStatement, find_statement
 from cosim.simulation.virtual_time import simulate
 from netem.core.core_library import core, pointer_to, reals_at
 from netem.core.errors import CallerError
+from noack.core.balls import number
 from noack.core.linear_systems import Matrix
 from noack.observers.kalman import KalmanSettings
 from noack.observers.observer_settings import EstimationModel
+from noack.proof.elaborate.errors import RefusedError, RejectedError
+from noack.proof.elaborate.scenario import read_loop
 from noack.proof.statement_proof import prove_statement
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import resolve
 from noack.settings.values import rows_of
-from noack_check.balls import number
-from noack_check.check import RejectedError
-from noack_check.keys import RefusedError
-from noack_check.scenario import read_loop
 from tests.checker.completed import completed
 from tests.checker.loops import FILTERED_MASS
 from tests.checker.proofs import proved

@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from flint import arb
+from flint import arb, fmpq
 
+from noack.proof.elaborate.tables import read_number
 from noack.proof.forms_proof import as_text, write_proof
 from noack.proof.loop_document import LoopDocument, Naming
+from noack.proof.search.results import read_assumptions
 from noack.proof.words import in_words
-from noack_check.document import read_number
-from noack_check.proof import read_assumptions
 from noack_kernel import RejectedError, Statement, prove
 from noack_kernel.__main__ import UNREADABLE, verify
+from noack_kernel.statement import root_above
 from tests.checker.proofs import SEARCHES, Proved, proved
 
 Table = dict[str, Any]
@@ -557,3 +558,10 @@ def test_files_are_json_of_exact_numbers() -> None:
 def test_a_folder_is_refused_by_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert verify(tmp_path, tmp_path) == UNREADABLE
     assert capsys.readouterr().err == f"noack-check: {tmp_path}: not a regular file\n"
+
+
+def test_bounds_beyond_floating_point_are_rounded_outwards() -> None:
+    """A float of such a number is infinite."""
+    large = fmpq(13) * fmpq(10) ** 399
+    assert str(root_above(large * large)) == "1.3E+400"
+    assert str(root_above(large * large + 1)) == "1.30001E+400"

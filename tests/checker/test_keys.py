@@ -2,7 +2,7 @@
 
 import pytest
 
-from noack_check.keys import key_table, refusals
+from noack.proof.elaborate.keys import key_table, refusals
 from tests.helpers.key_tables import faulty_rows, missing_keys, unknown_keys
 from tests.helpers.resolved_tables import resolved_tables
 from tests.helpers.schema_keys import SCHEMA_KEYS

@@ -5,7 +5,7 @@ import math
 import pytest
 from flint import arb
 
-from noack_check.balls import identity, matrix, number
+from noack.core.balls import identity, matrix, number
 from noack_gains.responses import Decay, EnclosedResponses, Question, enclose, responses
 
 _ACCURACY = 2e-3

@@ -6,13 +6,13 @@ from flint import fmpq
 from scipy.linalg import expm
 from scipy.optimize import linprog
 
+from noack.core.balls import number
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.hybrid_system import Model
+from noack.proof.elaborate.loop import Loop
+from noack.proof.search.results import Proof
 from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.documents import find_witness
-from noack_check.balls import number
-from noack_check.check import RejectedError
-from noack_check.loop import Loop
-from noack_check.model import Model
-from noack_check.proof import Proof
 from tests.checker.completed import completed
 from tests.checker.loops import double_integrator, loop_with, servo
 from tests.checker.proofs import by_gains

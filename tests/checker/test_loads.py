@@ -7,14 +7,13 @@ import pytest
 
 from cosim.analysis.witnesses import resolved_content
 from cosim.simulation.virtual_time import simulate
+from noack.proof.elaborate.errors import RefusedError, RejectedError
+from noack.proof.elaborate.scenario import read_loop
 from noack.proof.files import document_of
 from noack.proof.loop_document import Naming
 from noack.proof.statement_proof import prove_statement
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
-from noack_check.check import RejectedError
-from noack_check.keys import RefusedError
-from noack_check.scenario import read_loop
 from tests.checker.completed import completed
 from tests.checker.proofs import Proved, proved
 from tests.checker.runs import floats

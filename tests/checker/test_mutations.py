@@ -10,9 +10,9 @@ import functools
 import numpy as np
 import pytest
 
+from noack.proof.elaborate.loop import Loop
+from noack.proof.search.results import Proof
 from noack.proof.statement_proof import prove_statement
-from noack_check.loop import Loop
-from noack_check.proof import Proof
 from tests.checker.changes import DOCUMENTS, LOOPS, Document, accepted
 from tests.checker.floating_forms import Forms
 from tests.checker.proofs import proved

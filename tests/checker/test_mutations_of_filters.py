@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from cosim.analysis.witnesses import find_statement
+from noack.core.balls import matrix, number
+from noack.proof.elaborate.errors import RefusedError, RejectedError
+from noack.proof.elaborate.loop import Loop, Noise
+from noack.proof.elaborate.noise import noise_of
+from noack.proof.elaborate.scenario import read_loop
+from noack.proof.search.results import Proof, read_assumptions
 from noack.proof.statement_proof import prove_statement
-from noack_check.balls import matrix, number
-from noack_check.check import RejectedError
-from noack_check.keys import RefusedError
-from noack_check.loop import Loop, Noise
-from noack_check.noise import noise_of
-from noack_check.proof import Proof, read_assumptions
-from noack_check.scenario import read_loop
 from tests.checker.changes import DOCUMENTS, GAINS, accepted, places
 from tests.checker.loops import FILTERED_MASS
 from tests.checker.proofs import proved

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from flint import arb, arb_mat
 
+from noack.core.balls import identity, number
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.loop import Loop, Observer
 from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.documents import witness_by_gains
-from noack_check.balls import identity, number
-from noack_check.check import RejectedError
-from noack_check.loop import Loop, Observer
 from tests.checker.changes import GAINS, LOOPS, WINDOWS, accepted, places
 from tests.checker.loops import AREA, DUE, IDEAL, SCHEDULE, scalar, with_form
 from tests.checker.runs import exceeded, require_true

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from cosim.analysis.witnesses import resolved_content
+from noack.proof.elaborate.errors import RefusedError, RejectedError
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.scenario import read_loop
+from noack.proof.search.results import Proof
 from noack.proof.statement_proof import prove_statement
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
-from noack_check.check import RejectedError
-from noack_check.keys import RefusedError
-from noack_check.loop import Loop
-from noack_check.proof import Proof
-from noack_check.scenario import read_enclosed, read_loop
+from noack_equations import RejectedError as RejectedEquationsError
 from tests.checker.changes import DOCUMENTS
-from tests.checker.proofs import proved
+from tests.checker.proofs import enclosed_equations, proved
 from tests.oracles.attacked_regions import SCENARIOS, Field, Reals, largest_sizes
 
 Document = dict[str, Any]
@@ -86,9 +86,9 @@ CHANGES = [_number, _operation, _operand, _rates, _region, _further, *DOCUMENTS.
 
 def proven(content: Document, document: Document) -> tuple[Loop, Proof] | None:
     try:
-        loop = read_loop(content, box=False, ideal=True, enclosed=read_enclosed(content, document))
+        loop = read_loop(content, box=False, ideal=True, enclosed=enclosed_equations(content, document))
         return loop, prove_statement(loop, document)
-    except (RejectedError, RefusedError):
+    except (RejectedError, RefusedError, RejectedEquationsError):
         return None
 
 

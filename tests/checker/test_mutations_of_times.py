@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from flint import fmpq
 
+from noack.proof.elaborate.loop import Loop
+from noack.proof.search.results import Proof
 from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.documents import witness_by_gains
-from noack_check.loop import Loop
-from noack_check.proof import Proof
 from tests.checker.changes import DOCUMENTS, GAINS, LOOPS, accepted, places, scaled
 from tests.checker.loops import DRIFTING, IDEAL, NOISE, steady
 from tests.checker.proofs import proved

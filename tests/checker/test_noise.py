@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
+from noack.core.balls import matrix, number, zeros
+from noack.proof.elaborate.errors import RefusedError
+from noack.proof.elaborate.hybrid_system import Errors, Model
+from noack.proof.elaborate.scenario import read_loop
 from noack.proof.event_times import levels_of
 from noack.proof.files import proof_files
 from noack.proof.loop_document import Naming
+from noack.proof.search.results import Proof
 from noack.proof.statement_proof import prove_by_forms
 from noack.theory.witnesses.assumptions import inter_event_s
-from noack_check.balls import matrix, number, zeros
-from noack_check.keys import RefusedError
-from noack_check.model import Errors, Model
-from noack_check.proof import Proof
-from noack_check.scenario import read_loop
 from noack_kernel import RejectedError as RejectedByKernelError
 from noack_kernel import prove
 from tests.checker.completed import completed

@@ -9,15 +9,14 @@ import pytest
 from flint import arb, fmpq
 from scipy.linalg import expm
 
+from noack.core.balls import matrix, number, zeros
+from noack.proof.elaborate.errors import RefusedError, RejectedError
+from noack.proof.elaborate.hybrid_system import Model
+from noack.proof.elaborate.loop import Loop, Noise, Smooth
+from noack.proof.elaborate.noise import noise_of
+from noack.proof.elaborate.scenario import read_loop
 from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.assumptions import smooth_part
-from noack_check.balls import matrix, number, zeros
-from noack_check.check import RejectedError
-from noack_check.keys import RefusedError
-from noack_check.loop import Loop, Noise, Smooth
-from noack_check.model import Model
-from noack_check.noise import noise_of
-from noack_check.scenario import read_loop
 from tests.checker.completed import completed
 from tests.checker.loops import OBSERVED, OBSERVED_OUTPUT
 from tests.checker.proofs import Proved, proved
@@ -135,7 +134,7 @@ def test_bounds_do_not_decay_faster_than_the_error(rate: float) -> None:
 
 
 def test_gains_that_change_for_too_long_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("noack_check.noise._MOST_ENTRIES", 1000)
+    monkeypatch.setattr("noack.proof.elaborate.noise._MOST_ENTRIES", 1000)
     with pytest.raises(RejectedError, match="change for too long"):
         noise_of(filtered(PUSHED), RATE)
 

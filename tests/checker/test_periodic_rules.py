@@ -9,12 +9,12 @@ import pytest
 from flint import arb, fmpq
 
 from netem.core.periods import period_of
+from noack.core.balls import matrix, number
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.hybrid_system import Edge, Model
+from noack.proof.elaborate.loop import Loop, Times
+from noack.proof.elaborate.times import Schedule
 from noack.proof.statement_proof import prove_statement
-from noack_check.balls import matrix, number
-from noack_check.check import RejectedError
-from noack_check.loop import Loop, Times
-from noack_check.model import Edge, Model
-from noack_check.times import Schedule
 from tests.checker.changes import DOCUMENTS, accepted
 from tests.checker.changes import LOOPS as OTHER_LOOPS
 from tests.checker.completed import completed

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from noack.core.balls import number
+from noack.proof.elaborate.loop import Loop
+from noack.proof.search.results import Proof
 from noack.theory.witnesses.documents import find_witness
 from noack.theory.witnesses.effort import NoWitnessError
-from noack_check.balls import number
-from noack_check.loop import Loop
-from noack_check.proof import Proof
 from tests.checker.proofs import RANDOM, proved
 from tests.checker.random_loops import long_run_s, random_loop
 from tests.checker.runs import exceeded

@@ -9,6 +9,8 @@ import pytest
 from flint import arb, fmpq
 
 from cosim.simulation.virtual_time import simulate
+from noack.proof.elaborate.errors import RefusedError, RejectedError
+from noack.proof.elaborate.scenario import read_loop
 from noack.proof.statement_proof import prove_statement
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import loop_of, resolve
@@ -17,9 +19,6 @@ from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.witnesses.documents import witness_by_gains
 from noack.theory.witnesses.gains import find_by_gains
 from noack.theory.witnesses.outward import proven_bounds
-from noack_check.check import RejectedError
-from noack_check.keys import RefusedError
-from noack_check.scenario import read_loop
 from tests.checker.completed import completed
 from tests.checker.loops import SERVO, loop_with, servo
 from tests.checker.proofs import Proved, proved

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
+from noack.proof.elaborate.scenario import read_loop
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
-from noack_check.scenario import read_loop
 from tests.checker.runs import floats
 from tests.helpers.resolved_tables import resolved_tables
 from tests.helpers.shipped import shipped

@@ -11,8 +11,13 @@ from flint import fmpq
 
 from cosim.analysis.certificates import Certificates
 from cosim.analysis.witnesses import resolved_content
+from noack.core.balls import identity, matrix, number
 from noack.core.progress import no_progress
 from noack.proof import semidefinite
+from noack.proof.elaborate.hybrid_system import Model
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.scenario import read_loop
+from noack.proof.search.results import read_assumptions
 from noack.proof.semidefinite import Accuracy
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
@@ -24,11 +29,6 @@ from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.problem_size import problem_sizes, require_small
 from noack.theory.witnesses.search import Search
 from noack.theory.witnesses.templates import Templates
-from noack_check.balls import identity, matrix, number
-from noack_check.loop import Loop
-from noack_check.model import Model
-from noack_check.proof import read_assumptions
-from noack_check.scenario import read_loop
 from tests.checker.loops import SCHEDULE, bounds_of, double_integrator, pushed, scalar
 from tests.checker.proofs import proved
 from tests.checker.random_loops import long_run_s, random_loop

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
+from noack.core.balls import beside, identity, matrix, number, zeros
+from noack.proof.elaborate.errors import RefusedError, RejectedError
+from noack.proof.elaborate.hybrid_system import Model
+from noack.proof.elaborate.loop import Loop, Times
+from noack.proof.elaborate.tests_apart import Place, Places
 from noack.proof.statement_proof import prove_statement
-from noack_check.balls import beside, identity, matrix, number, zeros
-from noack_check.check import RejectedError
-from noack_check.keys import RefusedError
-from noack_check.loop import Loop, Times
-from noack_check.model import Model
-from noack_check.tests_apart import Place, Places
 from tests.checker.changes import DOCUMENTS, accepted
 from tests.checker.changes import LOOPS as OTHER_LOOPS
 from tests.checker.completed import completed

@@ -13,6 +13,7 @@ from netem.impairments.target_loss import loss_process
 from noack.core.linear_systems import Matrix
 from noack.proof.period_document import PeriodDocument
 from noack.proof.period_graph import PeriodGraph
+from noack.proof.search.growth import LATENCY_NS
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.scenario import arrival_ties
 from noack.scenario.arrival_ties import late_inputs, with_later_updates
@@ -20,7 +21,6 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.random_losses.mean_square_growth import growth_without_guarantee
 from noack.theory.witnesses.loss_margin import LossMargin, capped
-from noack_check.growth import LATENCY_NS
 
 CASE = Path(__file__).parents[1] / "cases" / "drive_tie.toml"
 """A packet every 10 ms arrives 25 ms later, at a tick of the controller, 5 ms after a transmission."""

@@ -13,9 +13,9 @@ from cosim.analysis.witnesses import find_statement
 from cosim.cli.application import app
 from netem.core.errors import ExitStatus
 from noack.plants.systems.traced_equations import NotEnclosedError, trace
+from noack.proof.elaborate.loop import Region
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
-from noack_check.loop import Region
 from noack_equations import RejectedError, enclose
 from tests.checker.traced_plants import Plant, unexplained
 

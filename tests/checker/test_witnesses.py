@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
+from noack.core.balls import is_zero, matrix
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.loop import Loop
 from noack.proof.statement_proof import prove_by_forms, prove_statement
-from noack_check.balls import is_zero, matrix
-from noack_check.check import RejectedError
-from noack_check.loop import Loop
 from tests.checker.completed import completed
 from tests.checker.loops import bounds_of, changed, double_integrator, holding, relative, with_rule
 from tests.checker.proofs import Proved, proved

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from flint import arb
 
-from noack_check.balls import number
-from noack_check.proof import Bound, Proof
+from noack.core.balls import number
+from noack.proof.search.results import Bound, Proof
 from tests.checker import write_witnesses
 from tests.checker.proofs import FOLDER, SEARCHES
 from tests.checker.write_witnesses import grown, write

@@ -10,8 +10,8 @@ import sys
 import tempfile
 from collections.abc import Mapping
 
+from noack.proof.search.results import Proof
 from noack.proof.statement_proof import prove_statement
-from noack_check.proof import Proof
 from tests.checker.proofs import FOLDER, SEARCHES, proved
 
 MOST_GROWTH = 1.03

@@ -8,8 +8,8 @@ from flint import arb
 
 from cosim.simulation.virtual_time import simulate_run
 from netem.core.errors import CallerError
+from noack.proof.search.results import Bound, Proof
 from noack.scenario.scenario_file import load
-from noack_check.proof import Bound, Proof
 from tests.fuzz.scenarios import __main__ as command
 from tests.fuzz.scenarios.check_draw import Checked, Checks, Contradiction, check_draw, fault_of_message
 from tests.fuzz.scenarios.draws import NEVER_DRAWN, draw, drawn_keys, schema_keys

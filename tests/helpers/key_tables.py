@@ -1,6 +1,6 @@
 """What every table of keys has: all keys of the schema, and no others."""
 
-from noack_check.keys import KeyTable
+from noack.proof.elaborate.keys import KeyTable
 from tests.helpers.schema_keys import SCHEMA_KEYS
 
 

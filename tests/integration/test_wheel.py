@@ -151,7 +151,6 @@ def test_the_wheel_contains_the_packages_and_their_data_only(dist: Path) -> None
         "controller_node",
         "netem",
         "cosim",
-        "noack_check",
         "noack_kernel",
         "noack_gains",
         "noack_equations",

@@ -15,8 +15,8 @@ from flint import arb
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from noack.proof.elaborate.loop import Loop
 from noack.theory.certificates.proven_bounds import ProvenBounds
-from noack_check.loop import Loop
 from tests.checker.runs import floats
 
 Reals = NDArray[np.float64]

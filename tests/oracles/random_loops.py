@@ -9,12 +9,12 @@ from cosim.analysis.margin_search import read_guarantee
 from cosim.cli.options import find_scenario
 from netem.guarantee.loss_guarantee import LossGuarantee
 from noack.core.linear_systems import Matrix
+from noack.proof.search.growth import PeriodicLoop
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.loss_margin import LossMargin, checked_guarantee
-from noack_check.growth import PeriodicLoop
 
 GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
 

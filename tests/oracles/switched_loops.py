@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from flint import arb_mat
 
+from noack.core.balls import matrix
 from noack.core.linear_systems import Matrix
+from noack.proof.search.growth import Burst, Guarantee, PeriodicLoop, Times
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.witnesses.growth import enclose_growth
-from noack_check.balls import matrix
-from noack_check.growth import Burst, Guarantee, PeriodicLoop, Times
 
 
 class SwitchedLoop(PeriodicLoop):

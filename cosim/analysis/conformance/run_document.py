@@ -11,14 +11,14 @@ from cosim.analysis.conformance.verdicts import EdgeKind, Place, Transition
 from cosim.analysis.witnesses import WitnessedStatement
 from netem.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
+from noack.proof.elaborate.hybrid_system import Edge
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.noise import noise_of
+from noack.proof.elaborate.tables import read_number
 from noack.proof.files import document_of
 from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
+from noack.proof.search.results import Assumptions
 from noack.theory.witnesses.coordinates import floats
-from noack_check.document import read_number
-from noack_check.loop import Loop
-from noack_check.model import Edge
-from noack_check.noise import noise_of
-from noack_check.proof import Assumptions
 
 _MOST_LATER, _FEW_LATER = 12, 2
 """Most events while an update is on its way in a document without a proof; with tests at exact times."""

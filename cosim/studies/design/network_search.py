@@ -24,6 +24,7 @@ from netem.core.errors import CallerError
 from netem.guarantee.loss_guarantee import LossGuarantee
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.core.progress import Progress, no_progress
+from noack.proof.search.growth import list_bursts
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.values import MatrixRows, rows_of
@@ -31,7 +32,6 @@ from noack.theory.coverage import require_exact
 from noack.theory.time_triggered.scenario_times import loop_times, without_timeout
 from noack.theory.witnesses.loss_margin import LossMargin, Stability, capped, checked_guarantee, uncapped
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
-from noack_check.growth import list_bursts
 
 COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
 """Factors of R of the regulators that the search begins with."""

@@ -16,9 +16,9 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 
 from noack.core.linear_systems import Matrix, Stack, Vector
 from noack.proof.period_times import LoopTimes
+from noack.proof.search.growth import Burst
 from noack.theory.time_triggered.graph import Graph, spectral_radii
 from noack.theory.time_triggered.time_triggered_loop import Timeline
-from noack_check.growth import Burst
 
 _FURTHER_EDGES, _MOST_EDGES = 5, 40
 """Edges of the longest cycles, beyond the number of nodes, and in all."""

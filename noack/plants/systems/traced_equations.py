@@ -11,10 +11,10 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from netem.core.errors import NoackError, one_line, shortened
+from noack.core.balls import number
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import PlantSystem
-from noack_check.balls import number
-from noack_check.equation_text import formulas
+from noack.plants.systems.equation_text import formulas
 from noack_equations import (
     SIGNALS,
     Enclosed,

@@ -12,5 +12,5 @@
 5. ``certified_bounds.py``: a certificate, which is what was proven, or the reason why nothing was, with the
    conditions and assumptions. ``output_bounds.py``: what it says about each output, in its own unit.
 
-The search for what can be proven is in :mod:`noack.theory.witnesses`, the proof in :mod:`noack_check`.
+The search for what can be proven is in :mod:`noack.theory.witnesses`, the proof in :mod:`noack.proof`.
 """

@@ -238,7 +238,7 @@ def about_reference(resolved: Scenario) -> Scenario:
     """Return the loop in the coordinates around its reference or set-point, which is 0 there.
 
     An observer's first estimate is moved, too: its error is the same. What disturbs the loop in these
-    coordinates is left out: see :mod:`noack_check.reference`.
+    coordinates is left out: see :mod:`noack.proof.elaborate.reference`.
     """
     loop = loop_of(resolved)
     if loop.reference is None:

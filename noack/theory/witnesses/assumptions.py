@@ -1,7 +1,7 @@
 """What a witness's model assumes: the size of the sensor's error, and events while an update is on its way.
 
 Each guess leads to a bound of the drift or of the error, and this to the next guess, until one confirms
-itself. Nothing here has to be right: :mod:`noack_check.proof` proves what is assumed.
+itself. Nothing here has to be right: :mod:`noack.proof.search.results` proves what is assumed.
 """
 
 import math
@@ -12,16 +12,16 @@ import numpy as np
 from flint import arb, fmpq
 from scipy.linalg import expm, logm, schur
 
+from noack.core.balls import matrix, number
+from noack.proof.elaborate.hybrid_system import thresholds
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.noise import noise_of
+from noack.proof.elaborate.norms import growth
 from noack.proof.loop_document import LoopDocument, Naming, NoDocumentError
 from noack.proof.quiet_start import write_quiet_start
+from noack.proof.search.results import MOST_LATER, Assumptions, compares_error, last_test_before, weighted
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError
-from noack_check.balls import matrix, number
-from noack_check.loop import Loop
-from noack_check.model import thresholds
-from noack_check.noise import noise_of
-from noack_check.norms import growth
-from noack_check.proof import MOST_LATER, Assumptions, compares_error, last_test_before, weighted
 
 _ROOM = 1.01
 """A guess is confirmed if what follows from it is smaller by this factor."""
@@ -194,7 +194,7 @@ def observer_decay(loop: Loop) -> float:
 
 
 def inter_event_s(loop: Loop, rate: float, drift: Sequence[float]) -> float:
-    """Return a time that :mod:`noack_check.proof` accepts between two events; 0 without one."""
+    """Return a time that :mod:`noack.proof.search.results` accepts between two events; 0 without one."""
     (D1, D2), (noise1, noise2) = drift, map(float, noise_of(loop, number(rate)).sizes)
     level, floor = float(loop.rule.level), float(loop.rule.floor)
     if rate != float(loop.rule.rate):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector
-from noack_check.model import Model
+from noack.proof.elaborate.hybrid_system import Model
 
 Frames = Mapping[str, Matrix]
 """By the name of a witness's matrix V: T with V = T⁻ᵀ V̂ T⁻¹, V̂ of order 1."""

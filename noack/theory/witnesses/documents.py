@@ -1,4 +1,4 @@
-"""The search for a whole witness: a document that :mod:`noack_check.proof` accepts."""
+"""The search for a whole witness: a document that :mod:`noack.proof.search.results` accepts."""
 
 import contextlib
 import math
@@ -7,7 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from noack.core.balls import number
 from noack.core.progress import Progress, no_progress
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.hybrid_system import Model
+from noack.proof.elaborate.loop import Loop
+from noack.proof.search.results import Bound, Proof, check_bound, compares_error, read_assumptions
 from noack.proof.semidefinite import Accuracy
 from noack.proof.statement_proof import joined, needs_gains, prove_by_forms, prove_by_gains
 from noack.theory.witnesses.assumptions import (
@@ -25,11 +30,6 @@ from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.problem_size import require_small, work_of_loop
 from noack.theory.witnesses.search import FREE, Found, Search, refined
 from noack.theory.witnesses.templates import Templates
-from noack_check.balls import number
-from noack_check.check import RejectedError
-from noack_check.loop import Loop
-from noack_check.model import Model
-from noack_check.proof import Bound, Proof, check_bound, compares_error, read_assumptions
 
 _COARSE = Accuracy(gap=1e-3, feasibility=1e-3, improves_steps=False)
 _ATTEMPTS = (

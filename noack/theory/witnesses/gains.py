@@ -8,17 +8,17 @@ from contextlib import suppress
 
 import numpy as np
 
+from noack.core.balls import number
 from noack.core.linear_systems import Matrix
+from noack.proof.elaborate.loop import Loop
 from noack.proof.forms_proof import as_text
 from noack.proof.gains_document import gains_document, proof_text
 from noack.proof.loop_document import Naming, NoDocumentError
+from noack.proof.search.results import compares_error
 from noack.theory.response_bounds import NotDecayingError, lyapunov_decay
 from noack.theory.witnesses.assumptions import before_due, observer_decay
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError
-from noack_check.balls import number
-from noack_check.loop import Loop
-from noack_check.proof import compares_error
 from noack_gains import Document, Gains, RejectedError, read_proof, share_of_threshold
 
 _SHARES = (1.0, 0.5, 0.2, 0.0)

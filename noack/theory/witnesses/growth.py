@@ -1,7 +1,7 @@
 """The search for witnesses of the growth of a loop that transmits at least at some times.
 
-They are documents for :mod:`noack_check.growth`. Nothing here has to be right: the checker verifies what is
-found, and every bound that is returned is one that it has accepted.
+They are documents for :mod:`noack.proof.search.growth`. Nothing here has to be right: that module tests in
+balls what is found, and returns the bounds that it has accepted.
 
 1. A cycle of bursts with the largest growth gives the lower bound ρ.
 2. For a growth γ little above ρ, Clarabel looks for quadratic forms, one for each node, with the smallest
@@ -16,13 +16,13 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Stack, Vector, balancing_exponents
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.search.growth import Burst, Growth, PeriodicLoop, prove_growth, remembering
 from noack.proof.semidefinite import Accuracy, MatrixInequality, minimise
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.effort import NoWitnessError
 from noack.theory.witnesses.outward import above, below
-from noack_check.check import RejectedError
-from noack_check.growth import Burst, Growth, PeriodicLoop, prove_growth, remembering
 
 Document = dict[str, object]
 ACCURACY = 2e-4

@@ -3,8 +3,8 @@
 The sensor is time-triggered, or transmits at unknown times with a longest time between two. A document
 without motions says what may happen from one transmission to the next (:mod:`noack.proof.period_document`),
 and every bound of the growth is one that the kernel has proven. Loops that transmit at unknown times while
-updates are on their way, or expire, have no such document: there the older verifier proves the growth
-(:mod:`noack_check.growth`, :mod:`noack.theory.witnesses.growth`).
+updates are on their way, or expire, have no such document: there the search encloses the growth in balls
+itself (:mod:`noack.proof.search.growth`, :mod:`noack.theory.witnesses.growth`), and no document shows it.
 """
 
 import math
@@ -22,14 +22,14 @@ from netem.guarantee.loss_guarantee import (
     LossGuarantee,
     outcome_letters,
 )
+from noack.proof.elaborate.errors import RefusedError
 from noack.proof.loop_document import NoDocumentError
+from noack.proof.search.growth import Guarantee, PeriodicLoop, read_periodic_loop
 from noack.scenario.arrival_ties import LATENCY_NS
 from noack.scenario.scenario import Scenario
 from noack.theory.time_triggered.scenario_times import intervals, require_covered, require_usable_updates
 from noack.theory.witnesses.growth import GrowthBounds, enclose_growth, intervals_of
 from noack.theory.witnesses.period_loops import Entry, ProvenGrowth, period_loop, prove_growth
-from noack_check.growth import Guarantee, PeriodicLoop, read_periodic_loop
-from noack_check.keys import RefusedError
 
 ACCURACY = 4e-3
 """Wanted upper/lower − 1 over the longest time between two transmissions."""
@@ -52,7 +52,7 @@ class Stability(NamedTuple):
     intervals_s: tuple[float, ...]
     """The time from each update of the pattern to the next one."""
     entries: Mapping[str, Entry] = MappingProxyType({})
-    """The entries of a proof of both bounds, "most" and "least"; none for the older verifier."""
+    """Entries of a proof of both bounds, "most" and "least"; none where no document describes the loop."""
     late: int = 0
     """Inputs may act so many steps of the plant late."""
 
@@ -163,7 +163,7 @@ class LossMargin:
 
     @cached_property
     def bursts_loop(self) -> PeriodicLoop:
-        """The loop as the older verifier has it.
+        """The loop as :mod:`noack.proof.search.growth` has it.
 
         Raises:
             CallerError: the loop is not covered.

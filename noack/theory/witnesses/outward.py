@@ -6,12 +6,11 @@ from fractions import Fraction
 
 from flint import arb, fmpq
 
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.noise import noise_of
+from noack.proof.search.results import Proof, smallest_bounds
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
 from noack.theory.witnesses.effort import NoWitnessError
-from noack_check.loop import Loop
-from noack_check.noise import noise_of
-from noack_check.proof import Proof
-from noack_check.sentences import smallest_bounds
 
 _DIGITS = 12
 """Significant digits: tables round decimals of this length, and stay true."""

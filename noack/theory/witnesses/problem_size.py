@@ -4,11 +4,11 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from flint import arb, fmpq
 
+from noack.proof.elaborate.hybrid_system import Model
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.tables import read_count
+from noack.proof.search.results import MOST_LATER, read_assumptions
 from noack.theory.witnesses.effort import TooLargeError, too_large
-from noack_check.document import read_count
-from noack_check.loop import Loop
-from noack_check.model import Model
-from noack_check.proof import MOST_LATER, read_assumptions
 
 _PER_ENTRY = 20_000
 """What the solver needs for each entry of an inequality, in products."""

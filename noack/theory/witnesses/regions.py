@@ -13,6 +13,8 @@ import numpy as np
 from noack.core.linear_systems import Vector
 from noack.core.progress import Progress, no_progress, part_of
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations
+from noack.proof.elaborate.loop import Loop
+from noack.proof.elaborate.scenario import read_region
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.documents import (
     RoughBounds,
@@ -22,8 +24,6 @@ from noack.theory.witnesses.documents import (
     witness_by_gains,
 )
 from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
-from noack_check.loop import Loop
-from noack_check.scenario import read_region
 
 _FIRST = 0.1
 """The first region, in multiples of what decides which coordinates it restricts."""

@@ -1,7 +1,7 @@
 """The search for a witness: quadratic forms for all locations, found in floating point.
 
-Nothing here has to be right: :mod:`noack_check` verifies what is found. The coordinates decide whether
-the solver succeeds. They come from simulated runs first, and from the first solution then.
+Nothing here has to be right: the kernel verifies what is found. The coordinates decide whether the solver
+succeeds. They come from simulated runs first, and from the first solution then.
 """
 
 from collections.abc import Mapping

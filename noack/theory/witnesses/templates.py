@@ -7,15 +7,15 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix
+from noack.proof.elaborate.hybrid_system import Inequality, Model, Part
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.problem_size import work_of
-from noack_check.model import Inequality, Model, Part
 
 _LOW, _HIGH = 1.0, 2.0
 
 
 class Template(NamedTuple):
-    """An inequality as :class:`noack_check.model.Inequality`, in floating point."""
+    """An inequality as :class:`noack.proof.elaborate.hybrid_system.Inequality`, in floating point."""
 
     name: str
     location: int
@@ -40,7 +40,7 @@ class Templates:
         self._outputs: dict[str, list[Template]] = {}
 
     def at(self, decay: float, output: str, *, starts: bool) -> list[Template]:
-        """Return the inequalities that bound an output: see :meth:`noack_check.model.Model.inequalities`."""
+        """Return the inequalities that bound an output: see :meth:`.hybrid_system.Model.inequalities`."""
         if output not in self._outputs:
             self._outputs[output] = [_template(item) for item in self.model.output_inequalities(output)]
         share = (decay - _LOW) / (_HIGH - _LOW)

@@ -10,9 +10,9 @@ import pytest
 
 from cosim.analysis.witness_store import INDEX, SHIPPED
 from cosim.analysis.witnesses import WitnessedStatement, find_statement
+from noack.proof.elaborate.loop import Loop
 from noack.theory.witnesses.documents import Witness, witness_by_gains
 from noack.theory.witnesses.effort import NoWitnessError
-from noack_check.loop import Loop
 from tests.checker.proofs import proved
 from tests.helpers.shipped import resolved
 

@@ -20,10 +20,10 @@ from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate
 from netem.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
+from noack.proof.search.results import smallest_bounds
 from noack.theory.certificates.conditions import allowed_conditions, outside_box
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
 from noack.theory.witnesses.loss_margin import Stability
-from noack_check.sentences import smallest_bounds
 from tests.helpers.approved import compare_text
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import resolved, shipped

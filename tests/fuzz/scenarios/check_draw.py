@@ -31,13 +31,13 @@ from cosim.record.run_directory import RunEnding
 from cosim.record.run_record import load_run
 from cosim.simulation.virtual_time import simulate_run
 from netem.core.errors import NoackError
+from noack.proof.search.results import Proof
 from noack.scenario.resolution import loop_of, resolve, resolve_run, resolved_loops
 from noack.scenario.scenario import Scenario, loops_by_entry
 from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions
 from noack.trigger_policies.decaying import DecayingSettings
-from noack_check.proof import Proof
 from tests.fuzz.scenarios.draws import Draw, draw, drawn_keys
 from tests.fuzz.scenarios.proven_bounds import proven_limit, sizes_of
 from tests.oracles.explained_run.explain import explains

@@ -8,9 +8,9 @@ import scipy.linalg
 from cosim.record.run_record import RunRecord
 from netem.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
+from noack.proof.search.results import Proof
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import loop_of
-from noack_check.proof import Proof
 
 
 def proven_limit(proof: Proof, output: str, t_s: Vector) -> Vector:

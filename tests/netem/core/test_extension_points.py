@@ -68,7 +68,8 @@ def test_certificates_cover_no_disturbance_and_no_policy_of_a_package(tmp_path: 
     gust = 'plant.disturbances=[{kind="gust", amplitude=[1.0]}]'
     policy = 'trigger={policy="impatient", delta=0.1}'
     program = (
-        "import sys; from noack_check.keys import refusals; from tests.helpers.shipped import resolved; "
+        "import sys; from noack.proof.elaborate.keys import refusals; "
+        "from tests.helpers.shipped import resolved; "
         "print(*refusals(dict(resolved('double_integrator', *sys.argv[1:]).content())), sep='\\n')"
     )
     output, warnings = run(tmp_path, "-c", program, gust, policy)

@@ -11,9 +11,9 @@ from scipy.signal import StateSpace
 import noack
 from cosim.analysis.witnesses import resolved_content
 from noack.plants.systems.traced_equations import NotEnclosedError
+from noack.proof.elaborate.scenario import read_loop
 from noack.scenario.resolution import loop_of, resolve
 from noack.theory.certificates.plant_equations import equations_of
-from noack_check.scenario import read_loop
 
 A, B, K = np.array([[0.0, 1.0], [0.0, -2.0]]), np.array([[0.0], [5.0]]), np.array([[-6.0, -1.2]])
 INTEGRAL = {"kind": "state_space", "A": [[0.0]], "B": [[1.0, 0.0]], "C": [[-8.0]]}

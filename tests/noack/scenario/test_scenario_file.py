@@ -16,10 +16,10 @@ import tomli_w
 from cosim.studies.campaign.campaign_file import load as load_campaign
 from netem.core import toml_file
 from netem.core.errors import CallerError
+from netem.core.toml_limits import MOST_LEVELS
 from netem.links_file import load_links
 from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario_file import dumps, load, put, validate, value_of
-from noack_check.files import MOST_LEVELS
 from tests.helpers.approved import compare_lines
 
 SHIPPED = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))

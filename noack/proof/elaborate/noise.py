@@ -23,9 +23,9 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import beside, columns_of, frobenius, identity, upto
-from noack_check.check import RejectedError
-from noack_check.loop import Loop, Noise, Observer, Smooth, no_smooth
+from noack.core.balls import beside, columns_of, frobenius, identity, upto
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.loop import Loop, Noise, Observer, Smooth, no_smooth
 
 _MOST_POWERS, _SMALL = 20_000, 1e-6
 _CELLS, _MOST_CELLS = 100, 16

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 from flint import arb, arb_mat
 
-from noack_check.balls import number
-from noack_check.check import RejectedError
+from noack.core.balls import number
+from noack.proof.elaborate.errors import RejectedError
 
 _MOST_ENTRIES = 100_000
 """Of a matrix. They are counted first: to read a number takes a microsecond."""

@@ -12,7 +12,7 @@ from typing import NamedTuple, Required, TypedDict
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import (
+from noack.core.balls import (
     beside,
     columns_of,
     identity,
@@ -24,14 +24,14 @@ from noack_check.balls import (
     transpose,
     zeros,
 )
-from noack_check.check import RejectedError
-from noack_check.document import read_table
-from noack_check.keys import RefusedError, Table, refusals
-from noack_check.loop import Along, Loop, Memory, Observer, Region, Rule, Times
-from noack_check.norms import lyapunov_function, spectral_norm
-from noack_check.reference import Matrices, Moments, Segment, about_reference, padded
-from noack_check.times import NS_PER_S, Schedule, fraction, nanoseconds, nearest_ns
-from noack_equations import LinearPlants, enclose, region_of
+from noack.proof.elaborate.errors import RefusedError, RejectedError
+from noack.proof.elaborate.keys import Table, refusals
+from noack.proof.elaborate.loop import Along, Loop, Memory, Observer, Region, Rule, Times
+from noack.proof.elaborate.norms import lyapunov_function, spectral_norm
+from noack.proof.elaborate.reference import Matrices, Moments, Segment, about_reference, padded
+from noack.proof.elaborate.tables import read_table
+from noack.proof.elaborate.times import NS_PER_S, Schedule, fraction, nanoseconds, nearest_ns
+from noack_equations import LinearPlants, region_of
 from noack_equations import RejectedError as RejectedEquationsError
 
 Rows = Sequence[Sequence[float]]
@@ -216,21 +216,6 @@ def _by_columns(x: Rows, u: Rows, height: int) -> arb_mat:
     """Return a column of n + m numbers for each row of x and u."""
     columns = [[*of_x, *of_u] for of_x, of_u in zip(x, u, strict=True)]
     return arb_mat(height, len(columns), [number(column[i]) for i in range(height) for column in columns])
-
-
-def read_enclosed(resolved: Table, document: Table) -> Enclosed:
-    """Return the equations of a witness's document, enclosed over its region.
-
-    Raises:
-        RefusedError: the scenario has no model.
-        RejectedError: the equations have no meaning, or no enclosure.
-    """
-    B = _matrix(_table(resolved, "model"), "model.B")
-    region = read_region(document, len(B), len(B[0]))
-    try:
-        return Enclosed(enclose(read_table(document, "equations"), region), region)
-    except RejectedEquationsError as error:
-        raise RejectedError(str(error)) from None
 
 
 def read_region(document: Table, n: int, m: int) -> Region:

@@ -2,7 +2,7 @@
 
 from flint import arb, arb_mat
 
-from noack_check.balls import identity, is_positive, square, upto
+from noack.core.balls import identity, is_positive, square, upto
 
 _CELLS = 64
 _MOST_CELLS = 20_000

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import beside, columns_of, frobenius, rows_of, upto, zeros
+from noack.core.balls import beside, columns_of, frobenius, rows_of, upto, zeros
 
 _ROUNDING = arb(10) ** -9
 """A jump of x_r is rounding up to this share of what is the largest entry of x_r and u_r up to then."""

@@ -37,11 +37,10 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import identity, is_positive, rows_of, stack, transpose, zeros
-from noack_check.check import RejectedError
-from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
-from noack_check.keys import RefusedError, Table
-from noack_check.scenario import (
+from noack.core.balls import identity, is_positive, rows_of, stack, transpose, zeros
+from noack.proof.elaborate.errors import RefusedError, RejectedError
+from noack.proof.elaborate.keys import Table
+from noack.proof.elaborate.scenario import (
     constant_delay_ns,
     loss_rules,
     read_linear_loop,
@@ -49,7 +48,8 @@ from noack_check.scenario import (
     times_between_events,
     update_timeout,
 )
-from noack_check.times import NS_PER_S
+from noack.proof.elaborate.tables import read_count, read_matrix, read_number, read_rows, read_table
+from noack.proof.elaborate.times import NS_PER_S
 
 _MOST_STEPS, _MOST_SLOTS, _MOST_SIZE, _MOST_UNITS = 20_000, 64, 80, 100_000
 MOST_BURSTS = 5000

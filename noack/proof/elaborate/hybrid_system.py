@@ -58,7 +58,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import (
+from noack.core.balls import (
     around_zero,
     beside,
     columns_of,
@@ -71,8 +71,8 @@ from noack_check.balls import (
     upto,
     zeros,
 )
-from noack_check.loop import Along, Loop, Memory, Noise
-from noack_check.tests_apart import Move, Place, Places
+from noack.proof.elaborate.loop import Along, Loop, Memory, Noise
+from noack.proof.elaborate.tests_apart import Move, Place, Places
 
 _CLOSE = 1000
 """Nodes of a periodic rule's clock are at least such a share of the period apart."""

@@ -1,22 +1,15 @@
-"""Verifies the inequalities of a model with the numbers of a witness."""
+"""Tests a search's solution in balls, before a proof is written: all inequalities of the hybrid system."""
 
 from collections.abc import Mapping
 from typing import TypeVar
 
 from flint import arb, arb_mat
 
-from noack_check.balls import is_positive, transpose
-from noack_check.model import Inequality, Model
+from noack.core.balls import is_positive, transpose
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.hybrid_system import Inequality, Model
 
-_LONGEST_MESSAGE = 300
 _Value = TypeVar("_Value", arb, arb_mat)
-
-
-class RejectedError(ValueError):
-    """A witness does not prove its statement; one line names the first inequality that fails."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message[:_LONGEST_MESSAGE].split()))
 
 
 def verify(

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import identity, is_zero
-from noack_check.check import RejectedError, verify
-from noack_check.document import read_count, read_matrix, read_number, read_rows, read_table
-from noack_check.loop import Loop, Noise, Smooth, Times
-from noack_check.model import Errors, Model
-from noack_check.noise import noise_of
-from noack_check.tests_apart import MOST_PLACES
+from noack.core.balls import identity, is_zero
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.elaborate.hybrid_system import Errors, Model
+from noack.proof.elaborate.loop import Loop, Noise, Smooth, Times
+from noack.proof.elaborate.noise import noise_of
+from noack.proof.elaborate.tables import read_count, read_matrix, read_number, read_rows, read_table
+from noack.proof.elaborate.tests_apart import MOST_PLACES
+from noack.proof.search.exact_test import verify
 
 MOST_PIECES = 64
 _MOST_COORDINATES = 200
@@ -240,3 +241,31 @@ def _exceeds_by_error(loop: Loop) -> bool:
         (positive[i, j], loop.weight[i, j - n] if j >= n else 0) for i in range(n) for j in range(2 * n)
     )
     return all(entry == expected for entry, expected in entries)
+
+
+def smallest_bounds(proof: Proof) -> list[Bound]:
+    """Return the bounds of a proof; of two bounds of the same output the smaller one.
+
+    Left out is a limit that is not below what the bound from the start on tends to.
+    """
+    smallest: dict[tuple[str, bool], Bound] = {}
+    for bound in proof.bounds:
+        key = (bound.output, bound.from_start)
+        if key not in smallest or size(bound) < size(smallest[key]):
+            smallest[key] = bound
+    return [
+        bound
+        for (output, from_start), bound in smallest.items()
+        if from_start or not _limit_is_implied(bound, smallest.get((output, True)), proof.rate)
+    ]
+
+
+def _limit_is_implied(limit: Bound, bound: Bound | None, rate: arb) -> bool:
+    return bound is not None and bool(rate > 0 and bound.constant <= limit.constant)
+
+
+def size(bound: Bound) -> float:
+    """Return the bound at t = 0, as it is printed, or what is left of one in the limit."""
+    if not bound.from_start:
+        return float(bound.constant.mid())
+    return float((bound.decaying + bound.constant).mid())

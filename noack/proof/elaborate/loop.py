@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import (
+from noack.core.balls import (
     columns_of,
     frobenius,
     identity,

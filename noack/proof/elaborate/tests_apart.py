@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from flint import fmpq
 
-from noack_check.loop import Times
+from noack.proof.elaborate.loop import Times
 
 MOST_PLACES = 160
 _CLOSE = 1000

@@ -15,10 +15,6 @@ _SHOWN = 60
 """Most characters of a value in a message."""
 
 
-class RefusedError(ValueError):
-    """No statement covers the scenario; the message is one line that names the key."""
-
-
 class Row(NamedTuple):
     """A row of a table of keys."""
 

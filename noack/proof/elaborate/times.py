@@ -19,7 +19,7 @@ from math import ceil, floor, gcd
 
 from flint import fmpq
 
-from noack_check.loop import Times
+from noack.proof.elaborate.loop import Times
 
 NS_PER_S = 10**9
 _ROUNDED_NS = 2
