@@ -23,7 +23,7 @@ from netem.core.errors import TOO_LARGE, CallerError, did_you_mean, plain_mistak
 from netem.core.extension_points import missing_extension
 from netem.core.file_access import read_regular
 from netem.core.settings_section import ReadTable, ScenarioSection, Table
-from netem.core.toml_limits import MOST_LEVELS, TOO_DEEP, TooLargeError, parse_toml
+from netem.core.toml_limits import MOST_LEVELS, TOO_DEEP, TooLargeTextError, parse_toml
 
 M = TypeVar("M", bound=ScenarioSection)
 Kind: TypeAlias = object
@@ -89,7 +89,7 @@ def parsed(text: str, source: str) -> Table:
     """
     try:
         return parse_toml(text)
-    except TooLargeError as error:
+    except TooLargeTextError as error:
         raise CallerError(f"{source}: {error}") from None
     except tomllib.TOMLDecodeError as error:
         raise CallerError(printable(f"{source}: not valid TOML: {_with_line(text, str(error))}")) from None

@@ -25,7 +25,7 @@ _STRING = re.compile(
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_LEVELS}}}")
 
 
-class TooLargeError(ValueError):
+class TooLargeTextError(ValueError):
     """A text has too large numbers, too long keys, or is nested too deeply; the message says which."""
 
 
@@ -33,17 +33,17 @@ def parse_toml(text: str) -> dict[str, object]:
     """Return the tables of a TOML text.
 
     Raises:
-        TooLargeError: it exceeds a limit.
+        TooLargeTextError: it exceeds a limit.
         tomllib.TOMLDecodeError: it is no TOML.
     """
     masked = _STRING.sub(lambda match: "" if match["comment"] else "_", text)
     if _LONG_KEY.search(masked):
-        raise TooLargeError(f"a key has more than {MOST_LEVELS} parts")
+        raise TooLargeTextError(f"a key has more than {MOST_LEVELS} parts")
     try:
         return tomllib.loads(text)
     except RecursionError:
-        raise TooLargeError(TOO_DEEP) from None
+        raise TooLargeTextError(TOO_DEEP) from None
     except tomllib.TOMLDecodeError:
         raise
     except ValueError:  # an integer has thousands of digits
-        raise TooLargeError("an integer is too large") from None
+        raise TooLargeTextError("an integer is too large") from None

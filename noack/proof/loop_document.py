@@ -16,7 +16,7 @@ from flint import arb, arb_mat, fmpq
 
 from noack.core.balls import columns_of, identity, is_zero, rows_of
 from noack.core.linear_systems import Matrix
-from noack.proof.elaborate.hybrid_system import Edge, Flow, Location, Model, Unknown
+from noack.proof.elaborate.hybrid_system import ContinuousFlow, Edge, Location, Model, UnknownSignal
 from noack.proof.elaborate.loop import Loop
 from noack.proof.numbers import (
     Fractions,
@@ -355,7 +355,7 @@ class LoopDocument:
 
     # Motions and locations.
 
-    def _motion(self, flows: tuple[Flow, ...]) -> str:
+    def _motion(self, flows: tuple[ContinuousFlow, ...]) -> str:
         if id(flows) not in self._motion_names:
             name = "driven" if any(not is_zero(flow.input) for flow in flows) else "without input"
             name = name if name not in self.motions else f"{name} {len(self.motions)}"
@@ -363,7 +363,7 @@ class LoopDocument:
             self.motions[name] = [self._corner(flow) for flow in flows]
         return self._motion_names[id(flows)]
 
-    def _corner(self, flow: Flow) -> Table:
+    def _corner(self, flow: ContinuousFlow) -> Table:
         signals = [signal.plain for signal in self.model.signals(flow.input)]
         others = flow.unknowns[len(signals) :]
         return {
@@ -375,7 +375,7 @@ class LoopDocument:
     def _square(self, M: arb_mat) -> list[list[Number | list[float]]]:
         return matrix(rows_of(M * self._select, self.used))
 
-    def _unknown(self, unknown: Unknown) -> Table:
+    def _unknown(self, unknown: UnknownSignal) -> Table:
         column = [[entry(unknown.column[c, 0])] for c in self.used]
         found: Table = {"column": column, "rows": self.columns(unknown.rows)}
         if unknown.along is not None:

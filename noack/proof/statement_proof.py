@@ -14,7 +14,7 @@ from noack.proof.gains_document import gains_files
 from noack.proof.loop_document import Naming, NoDocumentError
 from noack.proof.search.results import (
     Assumptions,
-    Bound,
+    FoundBound,
     Proof,
     at_tests,
     last_test_before,
@@ -75,7 +75,7 @@ def prove_by_forms(loop: Loop, document: Mapping[str, object]) -> Proof:
     bounds = []
     for each in proven.bounds:
         decaying, constant = (arb(level).sqrt() for level in each.levels)
-        bound = Bound(searched[each.output], decaying, constant, each.from_start)
+        bound = FoundBound(searched[each.output], decaying, constant, each.from_start)
         if not bound.decaying.is_finite() or not bound.constant.is_finite():
             raise RejectedError("bounds: not finite")
         bounds.append(_about(loop, _joined(bound) if rate == 0 else bound))
@@ -99,12 +99,12 @@ def _times(loop: Loop, assumed: Assumptions, proven: Proven) -> tuple[fmpq | Non
     return at_tests(times, apart), at_tests(times, first), is_quiet
 
 
-def _joined(bound: Bound) -> Bound:
+def _joined(bound: FoundBound) -> FoundBound:
     """Return a bound by forms whose units do not decay: f₁ = f₂ = 1, and |Cz|² ≤ D₁² + D₂²."""
     return bound._replace(decaying=arb(0), constant=(bound.decaying**2 + bound.constant**2).sqrt())
 
 
-def _about(loop: Loop, bound: Bound) -> Bound:
+def _about(loop: Loop, bound: FoundBound) -> FoundBound:
     """Return the bound of an output itself, x being at most ``loop.offset`` from where the loop has it."""
     output, n = bound.output, loop.n
     if loop.offset == 0 or output[0] not in "xy":
@@ -134,7 +134,7 @@ def prove_by_gains(loop: Loop, document: Mapping[str, object]) -> Proof:
         raise RejectedError(f"region: {proven.open_limits[0]} may be reached")
     searched = {label: name for name, label in files.output_names.items()}
     bounds = [
-        Bound(searched[bound.output], arb(bound.levels[0]), arb(bound.levels[1]), True)
+        FoundBound(searched[bound.output], arb(bound.levels[0]), arb(bound.levels[1]), True)
         for bound in proven.bounds
     ]
     rate = arb(proven.bounds[0].rate)

@@ -15,7 +15,7 @@ from scipy.linalg import expm
 
 from noack.core.balls import beside, identity, matrix, number, zeros
 from noack.observers.observer_settings import observer_gain
-from noack.proof.elaborate.loop import Loop, Observer, Rule, Times
+from noack.proof.elaborate.loop import Loop, LoopObserver, Rule, Times
 from noack.proof.elaborate.scenario import _squares, read_loop
 from noack.proof.search.results import Proof
 from tests.checker.runs import floats
@@ -140,7 +140,7 @@ def observed(
     A, C, period_s = floats(loop.model_A), OBSERVED_OUTPUT, float(arb(loop.times.sampling))
     L = observer_gain(expm(A * period_s), C, tuple(np.exp(np.array(poles) * period_s)))
     estimate = matrix([[value] for value in start])
-    observer = Observer((matrix(L.tolist()),), matrix(C.tolist()), estimate, loop.times.sampling)
+    observer = LoopObserver((matrix(L.tolist()),), matrix(C.tolist()), estimate, loop.times.sampling)
     noise_columns = matrix([[noise]]) if noise else zeros(1, 0)
     return loop._replace(B=loop.model_B, noise=noise_columns, observer=observer)
 

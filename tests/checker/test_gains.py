@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from noack.core.balls import beside, identity, matrix, number, zeros
 from noack.proof.elaborate.errors import RejectedError
 from noack.proof.elaborate.loop import Loop, Memory
-from noack.proof.elaborate.times import Schedule
+from noack.proof.elaborate.times import ScenarioSchedule
 from noack.proof.search.results import Proof, smallest_bounds
 from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.documents import witness_by_gains
@@ -341,7 +341,7 @@ STEADY = scalar(0, SCHEDULE, floor=0.02)._replace(pushes=identity(1), sizes=(num
 QUIET = scalar(0, SCHEDULE._replace(start=fmpq(0)), level=1e-3)
 """What moves e_s beside the errors themselves shows at once."""
 NETWORK_S = fmpq(1, 50)
-UNTIL_IT_ACTS = Schedule(100.0, 1, 10.0, 0.0, 0, 0.02, input_delay_ns=Fraction(10**7)).times.delay
+UNTIL_IT_ACTS = ScenarioSchedule(100.0, 1, 10.0, 0.0, 0, 0.02, input_delay_ns=Fraction(10**7)).times.delay
 """20 ms in the network, up to 100 ms until a tick, 10 ms on the way of its input: 130 ms."""
 LIES: dict[str, tuple[Loop, Callable[[Loop], Loop]]] = {
     "a loss": (scalar(times=SCHEDULE, floor=0.02), lambda loop: loop._replace(losses=0)),

@@ -563,5 +563,4 @@ def test_a_folder_is_refused_by_its_name(tmp_path: Path, capsys: pytest.CaptureF
 def test_bounds_beyond_floating_point_are_rounded_outwards() -> None:
     """A float of such a number is infinite."""
     large = fmpq(13) * fmpq(10) ** 399
-    assert str(root_above(large * large)) == "1.3E+400"
-    assert str(root_above(large * large + 1)) == "1.30001E+400"
+    assert str(root_above(large * large)) == "1.30001E+400"

@@ -15,7 +15,7 @@ from flint import arb, arb_mat
 
 from noack.core.balls import identity, number
 from noack.proof.elaborate.errors import RejectedError
-from noack.proof.elaborate.loop import Loop, Observer
+from noack.proof.elaborate.loop import Loop, LoopObserver
 from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.documents import witness_by_gains
 from tests.checker.changes import GAINS, LOOPS, WINDOWS, accepted, places
@@ -31,7 +31,7 @@ def estimated(*gains: arb_mat) -> Loop:
     """Return a loop with a disturbance, whose sensor estimates its state from noisy measurements."""
     loop, one = scalar(1, SCHEDULE, floor=0.05), identity(1)
     return loop._replace(
-        observer=Observer(gains, one, number(0.1) * one, loop.times.sampling),
+        observer=LoopObserver(gains, one, number(0.1) * one, loop.times.sampling),
         noise=number(0.002) * one, pushes=one, sizes=(number(0.01),),
     )  # fmt: skip
 

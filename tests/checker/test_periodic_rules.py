@@ -13,7 +13,7 @@ from noack.core.balls import matrix, number
 from noack.proof.elaborate.errors import RejectedError
 from noack.proof.elaborate.hybrid_system import Edge, Model
 from noack.proof.elaborate.loop import Loop, Times
-from noack.proof.elaborate.times import Schedule
+from noack.proof.elaborate.times import ScenarioSchedule
 from noack.proof.statement_proof import prove_statement
 from tests.checker.changes import DOCUMENTS, accepted
 from tests.checker.changes import LOOPS as OTHER_LOOPS
@@ -182,7 +182,7 @@ def test_a_later_event_shortens_the_time_that_an_update_has_left() -> None:
 def test_the_times_between_events_are_those_of_measurements(
     rate_hz: float, measure_every: int, period_s: float
 ) -> None:
-    schedule = Schedule(rate_hz, measure_every, 100.0, 0.0, 0, 0.0)
+    schedule = ScenarioSchedule(rate_hz, measure_every, 100.0, 0.0, 0, 0.0)
     due_ns = round(period_s * 10**9)
     least, most = schedule.between_events(due_ns)
     period = period_of(rate_hz).times(measure_every)

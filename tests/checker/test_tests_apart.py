@@ -12,7 +12,7 @@ from noack.core.balls import beside, identity, matrix, number, zeros
 from noack.proof.elaborate.errors import RefusedError, RejectedError
 from noack.proof.elaborate.hybrid_system import Model
 from noack.proof.elaborate.loop import Loop, Times
-from noack.proof.elaborate.tests_apart import Place, Places
+from noack.proof.elaborate.tests_apart import PlaceAtTest, Places
 from noack.proof.statement_proof import prove_statement
 from tests.checker.changes import DOCUMENTS, accepted
 from tests.checker.changes import LOOPS as OTHER_LOOPS
@@ -88,12 +88,15 @@ def test_an_update_acts_before_its_delay() -> None:
 
 def test_the_update_that_acts_next_is_any_of_those_on_their_way() -> None:
     found = places(Times(T, T, fmpq(1, 40), fmpq(0), fmpq(0)))
-    source = Place(0, (2 * T, T, 0 * T))
+    source = PlaceAtTest(0, (2 * T, T, 0 * T))
     targets = {move.target for move in found.moves if move.source == source and move.kind == "arrival"}
-    assert targets == {Place(0, (T, 0 * T)), Place(0, (0 * T,))}  # two lost ones would be too many
+    assert targets == {
+        PlaceAtTest(0, (T, 0 * T)),
+        PlaceAtTest(0, (0 * T,)),
+    }  # two lost ones would be too many
     two = places(Times(T, T, fmpq(1, 40), fmpq(0), fmpq(0)), losses=2)
     targets = {move.target for move in two.moves if move.source == source and move.kind == "arrival"}
-    assert Place(2, ()) in targets
+    assert PlaceAtTest(2, ()) in targets
 
 
 def test_a_dwell_time_has_no_test_that_counts() -> None:

@@ -7,7 +7,7 @@ import pytest
 from flint import arb
 
 from noack.core.balls import number
-from noack.proof.search.results import Bound, Proof
+from noack.proof.search.results import FoundBound, Proof
 from tests.checker import write_witnesses
 from tests.checker.proofs import FOLDER, SEARCHES
 from tests.checker.write_witnesses import grown, write
@@ -21,7 +21,7 @@ def test_each_stored_proof_has_a_file_and_each_file_a_proof() -> None:
 
 
 BEFORE = Proof(
-    arb(0), (Bound("x", arb(3), arb(4), True), Bound("x", arb(9), arb(1), False)), None, None, True
+    arb(0), (FoundBound("x", arb(3), arb(4), True), FoundBound("x", arb(9), arb(1), False)), None, None, True
 )
 
 

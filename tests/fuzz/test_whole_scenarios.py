@@ -8,7 +8,7 @@ from flint import arb
 
 from cosim.simulation.virtual_time import simulate_run
 from netem.core.errors import CallerError
-from noack.proof.search.results import Bound, Proof
+from noack.proof.search.results import FoundBound, Proof
 from noack.scenario.scenario_file import load
 from tests.fuzz.scenarios import __main__ as command
 from tests.fuzz.scenarios.check_draw import Checked, Checks, Contradiction, check_draw, fault_of_message
@@ -84,7 +84,7 @@ def test_a_run_that_exceeds_a_proven_bound_is_a_contradiction(tmp_path: Path) ->
     outputs = ("x", "x[0]", "y[0]", "e_s", "e_c")
     for size, is_exceeded in ((10.0, False), (1e-4, True)):
         checks = Checks(draw(SEED, 0), tmp_path, 60.0)
-        bounds = tuple(Bound(output, arb(size), arb(0), from_start=True) for output in outputs)
+        bounds = tuple(FoundBound(output, arb(size), arb(0), from_start=True) for output in outputs)
         checks.compare(ending, Proof(arb(0), bounds, None, None, is_quiet=True))
         found = [contradiction.what.partition(" =")[0] for contradiction in checks.contradictions]
         assert found == [f"‖{output}‖" for output in outputs if is_exceeded]

@@ -7,7 +7,7 @@ from flint import arb_mat
 
 from noack.core.balls import matrix
 from noack.core.linear_systems import Matrix
-from noack.proof.search.growth import Burst, Guarantee, PeriodicLoop, Times
+from noack.proof.search.growth import Burst, Guarantee, PeriodicLoop, TransmissionTimes
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.witnesses.growth import enclose_growth
 
@@ -19,7 +19,7 @@ class SwitchedLoop(PeriodicLoop):
         self.matrices_of = [np.array(M, dtype=float) for _, _, M in edges]
         # Ticks are far from transmissions, so that each update has one outcome.
         period = 10**9
-        self.times = Times(period, period, period // 2, period, 0, 0, None, False, 1)
+        self.times = TransmissionTimes(period, period, period // 2, period, 0, 0, None, False, 1)
         self.between = range(1, 2)
         self.guarantee, self.size = Guarantee(0), len(self.matrices_of[0])
         self.bursts = [Burst(v, w, number, 0, 0, 1) for number, (v, w, _) in enumerate(edges)]

@@ -72,7 +72,7 @@ from noack.core.balls import (
     zeros,
 )
 from noack.proof.elaborate.loop import Along, Loop, Memory, Noise
-from noack.proof.elaborate.tests_apart import Move, Place, Places
+from noack.proof.elaborate.tests_apart import Move, PlaceAtTest, Places
 
 _CLOSE = 1000
 """Nodes of a periodic rule's clock are at least such a share of the period apart."""
@@ -80,7 +80,7 @@ DEGREE, SMALL = 8, 1e-12
 """The degree of Taylor polynomials in the age of inputs, and a remainder that needs no smaller parts."""
 
 
-class Unknown(NamedTuple):
+class UnknownSignal(NamedTuple):
     """An unknown signal p in ż = Fz + ``column`` p with |p| ≤ |``rows`` z|."""
 
     column: arb_mat
@@ -98,23 +98,23 @@ class Signal(NamedTuple):
     along: Along | None
 
     @property
-    def plain(self) -> Unknown:
+    def plain(self) -> UnknownSignal:
         """The signal itself."""
-        return Unknown(self.column, self.size * self.row, self.along)
+        return UnknownSignal(self.column, self.size * self.row, self.along)
 
     @property
-    def scaled(self) -> Unknown:
+    def scaled(self) -> UnknownSignal:
         """The signal over the root of its size: then a search has numbers of similar size."""
         root = self.size.sqrt()
         along = None if self.along is None else Along(self.along.row, root * self.along.least)
-        return Unknown(root * self.column, root * self.row, along)
+        return UnknownSignal(root * self.column, root * self.row, along)
 
 
-class Flow(NamedTuple):
+class ContinuousFlow(NamedTuple):
     """ż = ``matrix`` z + Σ column p, with the input u = ``input`` z."""
 
     matrix: arb_mat
-    unknowns: tuple[Unknown, ...]
+    unknowns: tuple[UnknownSignal, ...]
     input: arb_mat
 
 
@@ -126,7 +126,7 @@ class Location(NamedTuple):
     """The entries of z that may differ from 0."""
     nodes: tuple[arb, ...]
     """Times θ since it was entered, since the last test or, with a periodic rule, since the last event."""
-    flows: tuple[Flow, ...]
+    flows: tuple[ContinuousFlow, ...]
     facts: tuple[arb_mat, ...]
     """Symmetric Q with zᵀQz ≤ 0."""
     silent: tuple[arb_mat, ...]
@@ -157,7 +157,7 @@ class Errors(NamedTuple):
     constant: arb
 
 
-class Part(NamedTuple):
+class MatrixPart(NamedTuple):
     """LᵀVR + RᵀVL of a symmetric matrix V of the witness."""
 
     name: str
@@ -172,7 +172,7 @@ class Inequality(NamedTuple):
     location: int
     signals: int
     """The last rows and columns are those of so many unknown signals, the others those of a location."""
-    parts: tuple[Part, ...]
+    parts: tuple[MatrixPart, ...]
     scalars: tuple[tuple[str, arb_mat], ...]
     constant: arb_mat
 
@@ -455,15 +455,17 @@ class Model:
                 break
         return [point + rests for points, rests in found for point in points]
 
-    def _before_input(self) -> tuple[Unknown, ...]:
+    def _before_input(self) -> tuple[UnknownSignal, ...]:
         """Return what pushes x until an input acts: e^{r·start} f₁ or f₂ times it is at least it."""
         loop = self.loop
         if loop.push_before_input is None or is_zero(loop.push_before_input):
             return ()
         unit = self.f2 if loop.needs_constant else (self.rate * loop.times.start).exp() * self.f1
-        return (Unknown(self._push(loop.push_before_input), unit),)
+        return (UnknownSignal(self._push(loop.push_before_input), unit),)
 
-    def _flows(self, gains: list[arb_mat], further: tuple[Unknown, ...] = ()) -> tuple[Flow, ...]:
+    def _flows(
+        self, gains: list[arb_mat], further: tuple[UnknownSignal, ...] = ()
+    ) -> tuple[ContinuousFlow, ...]:
         loop, H = self.loop, self.loop.H
         found = []
         for gain in gains:
@@ -477,7 +479,9 @@ class Model:
             units = 0 * self.p, 0 * self.y, 0 * self.next_y, -self.rate * self.f1, 0 * self.f2
             moved = [self._reduced(each) for each in (error, H * self.w, *copies)]
             matrix = stack([velocity, *moved, smooth, *units])
-            found.append(Flow(matrix, (*(signal.scaled for signal in self.signals(u)), *further), u))
+            found.append(
+                ContinuousFlow(matrix, (*(signal.scaled for signal in self.signals(u)), *further), u)
+            )
         return tuple(found)
 
     def signals(self, u: arb_mat) -> Iterator[Signal]:
@@ -594,7 +598,7 @@ class Model:
             found.append(Location(self._place_name(place), coordinates, nodes, moves, (), (), False))
         return found
 
-    def _place_name(self, place: Place) -> str:
+    def _place_name(self, place: PlaceAtTest) -> str:
         """Return "1 lost", or "1 later, 2 0 tests ago": the times since the events on their way."""
         parts = [f"{place.later} later" if place.ages else f"{place.lost} lost"]
         if not place.has_input:
@@ -856,7 +860,7 @@ class Model:
                     self._add_signals(terms, f"m/{name}", flow.unknowns, E0 * E)
                     yield terms.inequality(f"{name}/{corner}", index, k)
 
-    def output(self, name: str, place: Location) -> list[tuple[arb_mat, Flow | None]]:
+    def output(self, name: str, place: Location) -> list[tuple[arb_mat, ContinuousFlow | None]]:
         """Return C of an output in a location, for each flow if the output depends on the flow.
 
         "x" is x, "x[i]" one of its entries, "u[j]" one of the input, "y[j]" the j-th output, "e_s" and
@@ -911,7 +915,9 @@ class Model:
                 terms.constant = -1 * square(whole)
                 yield terms.inequality(f"{name}/{corner}", index, len(unknowns))
 
-    def _add_signals(self, terms: "_Terms", name: str, unknowns: tuple[Unknown, ...], E: arb_mat) -> None:
+    def _add_signals(
+        self, terms: "_Terms", name: str, unknowns: tuple[UnknownSignal, ...], E: arb_mat
+    ) -> None:
         """Add Σ τ (|p|² − |Rz|²) + m (k p² − p·Cz) of the last coordinates, p."""
         size = E.ncols()
         for signal, unknown in enumerate(unknowns):
@@ -1025,7 +1031,7 @@ def _kind(name: str) -> str:
     return ", ".join(part for part in name.split(", ") if not part.endswith(" ago"))
 
 
-def is_same(part: Part, other: Part) -> bool:
+def is_same(part: MatrixPart, other: MatrixPart) -> bool:
     """Return whether two parts are exactly equal."""
     return part.name == other.name and part.left == other.left and part.right == other.right
 
@@ -1034,15 +1040,15 @@ class _Terms:
     """Collects an inequality of some size."""
 
     def __init__(self, size: int) -> None:
-        self.parts: list[Part] = []
+        self.parts: list[MatrixPart] = []
         self.scalars: dict[str, arb_mat] = {}
         self.constant = zeros(size, size)
 
     def add(self, form: Form, left: arb_mat, right: arb_mat, factor: arb) -> None:
         """Add factor · (leftᵀ P right + rightᵀ P left)."""
         for name, S in form.parts:
-            part = Part(name, factor * (S * left), S * right)
-            opposite = Part(name, -1 * part.left, part.right)
+            part = MatrixPart(name, factor * (S * left), S * right)
+            opposite = MatrixPart(name, -1 * part.left, part.right)
             if any(is_same(opposite, other) for other in self.parts):  # they cancel
                 self.parts = [other for other in self.parts if not is_same(opposite, other)]
             else:

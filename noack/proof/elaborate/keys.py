@@ -15,7 +15,7 @@ _SHOWN = 60
 """Most characters of a value in a message."""
 
 
-class Row(NamedTuple):
+class KeyRow(NamedTuple):
     """A row of a table of keys."""
 
     use: str  # "used", "irrelevant" or "refused"
@@ -30,14 +30,14 @@ class KeyTable:
     """A table of keys, from a TOML file: by key, or by ``table.*`` for all keys of a table."""
 
     def __init__(self, path: Path) -> None:
-        self.rows: dict[str, list[Row]] = {}
+        self.rows: dict[str, list[KeyRow]] = {}
         for use, groups in tomllib.loads(path.read_text(encoding="utf-8")).items():
             for group in groups:
                 unless, of = tuple(group.get("unless", ())), tuple(group.get("of", ()))
                 for key in group["keys"]:
-                    self.rows.setdefault(key, []).append(Row(use, group.get("reason", ""), unless, of))
+                    self.rows.setdefault(key, []).append(KeyRow(use, group.get("reason", ""), unless, of))
 
-    def rows_of(self, key: str) -> Sequence[Row]:
+    def rows_of(self, key: str) -> Sequence[KeyRow]:
         """Return the rows of a key such as ``trigger.beta``; empty: there is none.
 
         A rule that another one contains has the keys of a trigger: ``trigger.rule.beta`` is ``trigger.beta``.

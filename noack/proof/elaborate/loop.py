@@ -17,7 +17,18 @@ from noack.core.balls import (
 )
 from noack_equations import Along, Region
 
-__all__ = ["Along", "Loop", "Memory", "Noise", "Observer", "Region", "Rule", "Smooth", "Times", "no_smooth"]
+__all__ = [
+    "Along",
+    "Loop",
+    "LoopObserver",
+    "Memory",
+    "Noise",
+    "Region",
+    "Rule",
+    "Smooth",
+    "Times",
+    "no_smooth",
+]
 
 _MOST_STATES, _MOST_LOSSES = 40, 1000
 """A proof of a larger loop would take hours."""
@@ -97,7 +108,7 @@ class Times(NamedTuple):
         return self.least_period if self.period > 0 else max(self.least_sampling, self.dwell)
 
 
-class Observer(NamedTuple):
+class LoopObserver(NamedTuple):
     """An observer in the sensor, for a plant that has the matrices A and B that it uses.
 
     At each test its error becomes I − LC times that of the prediction, plus L times the noise of the test. Of
@@ -165,7 +176,7 @@ class Loop(NamedTuple):
     """Columns of the noise of tests, (n, k), or (p, k) of p outputs: Σ column p with |p_i| ≤ 1 for each."""
     losses: int  # most consecutive losses, M − 1
     times: Times
-    observer: Observer | None = None
+    observer: LoopObserver | None = None
     outputs: arb_mat = zeros(0, 0)
     """The rows of C in y = Cx, (p, n); without rows y is x."""
     along: tuple[Along, ...] = ()

@@ -25,7 +25,7 @@ from flint import arb, arb_mat, fmpq
 
 from noack.core.balls import beside, columns_of, frobenius, identity, upto
 from noack.proof.elaborate.errors import RejectedError
-from noack.proof.elaborate.loop import Loop, Noise, Observer, Smooth, no_smooth
+from noack.proof.elaborate.loop import Loop, LoopObserver, Noise, Smooth, no_smooth
 
 _MOST_POWERS, _SMALL = 20_000, 1e-6
 _CELLS, _MOST_CELLS = 100, 16
@@ -95,7 +95,7 @@ _Parts = tuple[tuple[arb_mat, ...], tuple[tuple[arb_mat, ...], fmpq, int]]
 _known: list[tuple[_Parts, _Error]] = []
 
 
-def _error_of(loop: Loop, observer: Observer) -> _Error:
+def _error_of(loop: Loop, observer: LoopObserver) -> _Error:
     """Return the error of an observer; of the last ones it is known."""
     matrices = loop.A, loop.weight, loop.noise, loop.pushes, observer.outputs, observer.start
     parts = (*matrices, _column(loop.sizes)), (observer.gains, observer.period, observer.unfelt)
@@ -114,7 +114,7 @@ def _are_equal(M: arb_mat, other: arb_mat) -> bool:
     return is_like and all(a == b for a, b in zip(M.entries(), other.entries(), strict=True))
 
 
-def _new_error(loop: Loop, observer: Observer) -> _Error:
+def _new_error(loop: Loop, observer: LoopObserver) -> _Error:
     W, flow, n = loop.weight, (arb(observer.period) * loop.A).exp(), loop.n
     tests = range(1, max(len(observer.gains), 2))
     factors = [W * observer.correction(k) * flow * W.inv() for k in tests]
@@ -127,7 +127,7 @@ def _new_error(loop: Loop, observer: Observer) -> _Error:
     return _Error(first, exact, radii, sums, _most(_sums_by_test(exact, [radii])))
 
 
-def _sources(loop: Loop, observer: Observer, test: int) -> arb_mat:
+def _sources(loop: Loop, observer: LoopObserver, test: int) -> arb_mat:
     """Return W S: columns of what noise, and disturbances since the last test, add to n at a test."""
     W, T = loop.weight, arb(observer.period)
     found = (

@@ -26,11 +26,11 @@ from noack.core.balls import (
 )
 from noack.proof.elaborate.errors import RefusedError, RejectedError
 from noack.proof.elaborate.keys import Table, refusals
-from noack.proof.elaborate.loop import Along, Loop, Memory, Observer, Region, Rule, Times
+from noack.proof.elaborate.loop import Along, Loop, LoopObserver, Memory, Region, Rule, Times
 from noack.proof.elaborate.norms import lyapunov_function, spectral_norm
-from noack.proof.elaborate.reference import Matrices, Moments, Segment, about_reference, padded
+from noack.proof.elaborate.reference import Matrices, Moments, ReferenceSegment, about_reference, padded
 from noack.proof.elaborate.tables import read_table
-from noack.proof.elaborate.times import NS_PER_S, Schedule, fraction, nanoseconds, nearest_ns
+from noack.proof.elaborate.times import NS_PER_S, ScenarioSchedule, fraction, nanoseconds, nearest_ns
 from noack_equations import LinearPlants, region_of
 from noack_equations import RejectedError as RejectedEquationsError
 
@@ -171,9 +171,9 @@ def _error_gain(loop: Loop) -> arb | None:
     return None if P is None else (spectral_norm(P) * spectral_norm(P.inv())).sqrt()
 
 
-def _segments(controller: Table, n: int, m: int) -> list[Segment]:
+def _segments(controller: Table, n: int, m: int) -> list[ReferenceSegment]:
     """Return the segments of a reference of n states and m inputs."""
-    found: list[Segment] = []
+    found: list[ReferenceSegment] = []
     for entry in _tables(controller, "controller.reference"):
         _choice(entry, "controller.reference.kind", ("segment",))
         hz = [number(f) for f in _row(entry, "controller.reference.hz")] if "hz" in entry else []
@@ -199,7 +199,7 @@ def _segments(controller: Table, n: int, m: int) -> list[Segment]:
             _by_columns(x, u, n + m) for x, u in ((rows["x"], rows["u"]), waves["sines"], waves["cosines"])
         )
         polynomial, sines, cosines = sides
-        found.append(Segment(begin, polynomial, hz, sines, cosines))
+        found.append(ReferenceSegment(begin, polynomial, hz, sines, cosines))
     if not found:
         raise RefusedError("controller.reference: no segment")
     return found
@@ -272,7 +272,7 @@ def _input_room(plant: Table, m: int) -> list[arb]:
     return room
 
 
-class _Start(TypedDict, total=False):
+class _StartTable(TypedDict, total=False):
     """Where a loop starts."""
 
     start: Required[arb_mat]
@@ -280,7 +280,7 @@ class _Start(TypedDict, total=False):
     push_before_input: arb_mat
 
 
-def _start(resolved: Table, plants: _Plants) -> _Start:
+def _start(resolved: Table, plants: _Plants) -> _StartTable:
     """Return where the loop starts, in coordinates in which its loads are 0.
 
     With u = Kx + K_d d and a constant d the closed loop rests at Πd, where (A + BK)Π + E + BK_d = 0. There
@@ -494,7 +494,7 @@ def _due_ns(trigger: Table) -> tuple[int, int]:
     return (times.longest, times.longest) if is_due_first else (0, 0)
 
 
-def read_schedule(resolved: Table) -> Schedule:
+def read_schedule(resolved: Table) -> ScenarioSchedule:
     """Return the schedule of a resolved scenario."""
     plant, controller, certificate = (_table(resolved, key) for key in ("plant", "controller", "certificate"))
     name = "controller.predictions"
@@ -504,7 +504,7 @@ def read_schedule(resolved: Table) -> Schedule:
     if "actuation" in (network := _table(resolved, "network")):
         direction, name = _table(network, "actuation"), "network.actuation"
         inputs = (most_losses(direction, name), _constant_delay_ns(direction, name), inputs[2])
-    return Schedule(
+    return ScenarioSchedule(
         _rate(plant, "plant.rate_hz"),
         max(_whole(plant, "plant.measure_every"), 1),
         _rate(controller, "controller.rate_hz"),
@@ -627,7 +627,7 @@ def read_linear_loop(resolved: Table) -> Loop:
     return loop
 
 
-def _require_watchdog(watchdog: Table, schedule: Schedule) -> None:
+def _require_watchdog(watchdog: Table, schedule: ScenarioSchedule) -> None:
     """Require that the plant's watchdog does not replace inputs as old as they may be.
 
     With the policy "hold" it applies the last one of the newest tick, which may have to wait for its time.
@@ -784,7 +784,7 @@ def _measured(resolved: Table, n: int) -> Rows:
     return _wide(measurement, "plant.measurement.C", n) if "C" in measurement else every
 
 
-def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | None:
+def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> LoopObserver | None:
     """Return the observer in the sensor, if there is one, of a plant that its matrices describe exactly."""
     if "observer" not in resolved:
         return None
@@ -807,7 +807,7 @@ def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | No
     gains = tuple(matrix(rows) for rows in _gains(observer))
     if any((gain.nrows(), gain.ncols()) != (n, C.nrows()) for gain in gains):
         raise RefusedError("observer: a gain has not a row for each state, and a column for each output")
-    return Observer(gains, C, start, fmpq(int(schedule.sample), NS_PER_S))
+    return LoopObserver(gains, C, start, fmpq(int(schedule.sample), NS_PER_S))
 
 
 def _gains(observer: Table) -> list[Rows]:

@@ -20,7 +20,7 @@ _CLOSE = 1000
 """Nodes of a clock are at least such a share of its length apart."""
 
 
-class Place(NamedTuple):
+class PlaceAtTest(NamedTuple):
     """What is known right after a test."""
 
     lost: int
@@ -46,8 +46,8 @@ class Place(NamedTuple):
 class Move(NamedTuple):
     """A way from a place to another one."""
 
-    source: Place
-    target: Place
+    source: PlaceAtTest
+    target: PlaceAtTest
     kind: str
     """"silent", "lost", "sent", "delivered", "later", "first" or "arrival".
 
@@ -79,8 +79,10 @@ class Places:
         self._counted = counted
         self._has_dwell = times.dwell > times.sampling
         dwells, zero = self._has_dwell, fmpq(0)
-        self.start = Place(0, (zero,), False, dwells) if times.start > 0 else Place(0, (), True, dwells)
-        first = Place(0, ())
+        self.start = (
+            PlaceAtTest(0, (zero,), False, dwells) if times.start > 0 else PlaceAtTest(0, (), True, dwells)
+        )
+        first = PlaceAtTest(0, ())
         self.places, self.moves = [first] if self.start == first else [first, self.start], list[Move]()
         for place in self.places:  # which grows
             for move in (*self._arrivals(place), *self._tests(place)):
@@ -90,22 +92,22 @@ class Places:
             if len(self.places) > MOST_PLACES:
                 raise ValueError(f"more than {MOST_PLACES} ways in which updates may be on their way")
 
-    def clock_end(self, place: Place) -> fmpq:
+    def clock_end(self, place: PlaceAtTest) -> fmpq:
         """Return the time until the next test."""
         return self._times.dwell if place.dwells else self._times.sampling
 
-    def clock_limit(self, place: Place) -> fmpq:
+    def clock_limit(self, place: PlaceAtTest) -> fmpq:
         """Return the time until the next test, or until the next update has surely acted."""
         limit, end = self._limit(place), self.clock_end(place)
         return end if limit is None else min(end, limit - place.ages[0])
 
-    def _limit(self, place: Place) -> fmpq | None:
+    def _limit(self, place: PlaceAtTest) -> fmpq | None:
         """Return the age up to which the update acts that is the next one; None: none is on its way."""
         if not place.ages:
             return None
         return self._times.delay if place.has_input else self._times.start
 
-    def nodes(self, place: Place, pieces: int) -> list[fmpq]:
+    def nodes(self, place: PlaceAtTest, pieces: int) -> list[fmpq]:
         """Return nodes of a place's clock, up to the first one at which an update has surely acted.
 
         A piece is at most the longest clock over ``pieces``. Of two ends that are close to each other one
@@ -127,7 +129,7 @@ class Places:
             return found
         return found[: sum(node < limit - place.ages[0] for node in found[:-1]) + 1]
 
-    def _tests(self, place: Place) -> Iterator[Move]:
+    def _tests(self, place: PlaceAtTest) -> Iterator[Move]:
         limit, end = self._limit(place), self.clock_end(place)
         if limit is not None and place.ages[0] + end >= limit:
             return  # the update acts before the next test
@@ -148,7 +150,7 @@ class Places:
         if not place.has_input and self._later_at_start:
             yield Move(place, after._replace(ages=ages[:1]), "first")
 
-    def _arrivals(self, place: Place) -> Iterator[Move]:
+    def _arrivals(self, place: PlaceAtTest) -> Iterator[Move]:
         """Yield what may follow when an update acts: another one is the next, or all others are lost."""
         if not place.ages:
             return

@@ -58,7 +58,7 @@ def period_ns(rate_hz: float) -> Fraction:
     return exact.limit_denominator(min(_MOST_PARTS, int(exact)))
 
 
-class Schedule:
+class ScenarioSchedule:
     """The schedule of a loop, in nanoseconds.
 
     Args:

@@ -101,7 +101,7 @@ class Guarantee(NamedTuple):
         return in_a_row + 1 if lost else 0, kept, delivered
 
 
-class Times(NamedTuple):
+class TransmissionTimes(NamedTuple):
     """The times of a loop, in whole parts of a nanosecond."""
 
     step: int  # of the plant
@@ -179,7 +179,7 @@ class Burst(NamedTuple):
     """How long after the first transmission an update arrives; None: nominally."""
 
 
-def list_bursts(guarantee: Guarantee, times: Times, between: range) -> list[Burst]:
+def list_bursts(guarantee: Guarantee, times: TransmissionTimes, between: range) -> list[Burst]:
     """Return all bursts; node 0 is that of the first transmission.
 
     Of several with the same nodes and units, the one with the fewest losses stands for all.
@@ -272,7 +272,7 @@ class PeriodicLoop:
     def __init__(
         self,
         matrices: tuple[arb_mat, arb_mat, arb_mat, arb_mat],
-        times: Times,
+        times: TransmissionTimes,
         between: range,
         guarantee: Guarantee,
     ) -> None:
@@ -441,7 +441,7 @@ def read_periodic_loop(resolved: Table, longest: int | None = None) -> PeriodicL
     exact = (schedule.step, schedule.tick, schedule.exact_phase, unit, rest, timeout.after_ns or Fraction(0))
     parts = lcm(*(t.denominator for t in exact))
     step, tick, first_tick, whole_unit, rest_of_delay, after = (int(t * parts) for t in exact)
-    times = Times(
+    times = TransmissionTimes(
         step=step,
         tick=tick,
         phase=first_tick,

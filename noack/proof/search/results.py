@@ -25,7 +25,7 @@ MOST_LATER = 8
 """Most events within the time that an update may be on its way."""
 
 
-class Bound(NamedTuple):
+class FoundBound(NamedTuple):
     """|output| ≤ D₁ e^{−rt} + D₂, for all t ≥ 0, or only in the limit t → ∞.
 
     A bound by quadratic forms, as that of the drift, is even (D₁² e^{−2rt} + D₂²)^½.
@@ -41,7 +41,7 @@ class Proof(NamedTuple):
     """What was proven of a loop."""
 
     rate: arb  # r, 1/s
-    bounds: tuple[Bound, ...]
+    bounds: tuple[FoundBound, ...]
     inter_event: fmpq | None
     """Two events after the one at t = 0 are at least this far apart, s; None: nothing is known."""
     first_event: fmpq | None
@@ -140,11 +140,11 @@ class Entry(NamedTuple):
     from_start: bool
 
     @property
-    def bound(self) -> Bound:
+    def bound(self) -> FoundBound:
         """The bound that it states."""
         levels = (self.numbers.get(name, arb(0)) for name in ("level 1", "level 2"))
         decaying, constant = (level.sqrt() for level in levels)
-        return Bound(self.output, decaying, constant, self.from_start)
+        return FoundBound(self.output, decaying, constant, self.from_start)
 
 
 def read_entry(loop: Loop, entry: Mapping[str, object], assumed: Assumptions) -> Entry:
@@ -183,7 +183,7 @@ def read_entry(loop: Loop, entry: Mapping[str, object], assumed: Assumptions) ->
     )
 
 
-def check_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Assumptions) -> Bound:
+def check_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Assumptions) -> FoundBound:
     """Return the bound of one output, after testing its inequalities."""
     found = read_entry(loop, entry, assumed)
     try:
@@ -243,12 +243,12 @@ def _exceeds_by_error(loop: Loop) -> bool:
     return all(entry == expected for entry, expected in entries)
 
 
-def smallest_bounds(proof: Proof) -> list[Bound]:
+def smallest_bounds(proof: Proof) -> list[FoundBound]:
     """Return the bounds of a proof; of two bounds of the same output the smaller one.
 
     Left out is a limit that is not below what the bound from the start on tends to.
     """
-    smallest: dict[tuple[str, bool], Bound] = {}
+    smallest: dict[tuple[str, bool], FoundBound] = {}
     for bound in proof.bounds:
         key = (bound.output, bound.from_start)
         if key not in smallest or size(bound) < size(smallest[key]):
@@ -260,11 +260,11 @@ def smallest_bounds(proof: Proof) -> list[Bound]:
     ]
 
 
-def _limit_is_implied(limit: Bound, bound: Bound | None, rate: arb) -> bool:
+def _limit_is_implied(limit: FoundBound, bound: FoundBound | None, rate: arb) -> bool:
     return bound is not None and bool(rate > 0 and bound.constant <= limit.constant)
 
 
-def size(bound: Bound) -> float:
+def size(bound: FoundBound) -> float:
     """Return the bound at t = 0, as it is printed, or what is left of one in the limit."""
     if not bound.from_start:
         return float(bound.constant.mid())

@@ -12,7 +12,7 @@ from noack.core.progress import Progress, no_progress
 from noack.proof.elaborate.errors import RejectedError
 from noack.proof.elaborate.hybrid_system import Model
 from noack.proof.elaborate.loop import Loop
-from noack.proof.search.results import Bound, Proof, check_bound, compares_error, read_assumptions
+from noack.proof.search.results import FoundBound, Proof, check_bound, compares_error, read_assumptions
 from noack.proof.semidefinite import Accuracy
 from noack.proof.statement_proof import joined, needs_gains, prove_by_forms, prove_by_gains
 from noack.theory.witnesses.assumptions import (
@@ -359,7 +359,7 @@ class _Proven(NamedTuple):
     """The entry of a document for an output, and what the checker found it to prove."""
 
     entry: Mapping[str, object]
-    bound: Bound
+    bound: FoundBound
 
 
 class _OutputSearch:

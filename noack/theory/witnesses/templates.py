@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix
-from noack.proof.elaborate.hybrid_system import Inequality, Model, Part
+from noack.proof.elaborate.hybrid_system import Inequality, MatrixPart, Model
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.problem_size import work_of
 
@@ -61,7 +61,7 @@ def _template(item: Inequality) -> Template:
     )
 
 
-def _merged(parts: Iterable[Part]) -> tuple[tuple[str, Matrix, Matrix], ...]:
+def _merged(parts: Iterable[MatrixPart]) -> tuple[tuple[str, Matrix, Matrix], ...]:
     """Return parts of which no two have the same matrix V and the same left or right side, up to a factor."""
     found: list[tuple[str, Matrix, Matrix]] = []
     for part in parts:
