@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes
 # Says what is being done, and every 8 s that it goes on; with --late only then.
 SAY := $(BIN)/python tools/with_progress.py
-EDITABLE := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+EDITABLE := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e netem -e .
 
 SCENARIO ?= scenarios/lane_following.toml
 CAMPAIGN ?= mb_vs_zoh
@@ -184,25 +184,27 @@ docs-serve: docs ## Build the site and serve it on http://127.0.0.1:8000
 
 lock: setup-dev ## Update the pinned dependencies
 	$(SAY) "resolving dependencies" $(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml --extra viewer --group build -o requirements.lock
+		--no-header --no-emit-package noack-netem pyproject.toml --extra viewer --group build -o requirements.lock
 	$(BIN)/python tools/extension_requirements.py | \
 		$(SAY) "resolving dependencies" $(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml - --extra viewer --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
+		--no-header --no-emit-package noack-netem pyproject.toml - --extra viewer --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
 	$(BIN)/python tools/extension_requirements.py noack-lab | \
 		$(SAY) "resolving dependencies" $(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml - --extra viewer -c requirements-dev.lock -o requirements-lab.lock
+		--no-header --no-emit-package noack-netem pyproject.toml - --extra viewer -c requirements-dev.lock -o requirements-lab.lock
 	$(SAY) "resolving dependencies" $(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header --group compiler -o requirements-compiler.lock
 
-dist: setup-dev ## Build the sdist, and from it the wheels for Linux, macOS and Windows, into dist/
+dist: setup-dev ## Build the sdists, and from them the wheels, into dist/
 	@rm -rf dist
 	@$(SAY) "installing the compiler for all platforms" $(PIP) -r requirements-compiler.lock
-	@$(SAY) "building the sdist" $(BIN)/uv build --quiet --sdist --no-build-isolation --out-dir dist .
+	@$(SAY) "building noack's sdist" $(BIN)/uv build --quiet --sdist --no-build-isolation --out-dir dist .
+	@$(SAY) "building noack-netem's sdist" $(BIN)/uv build --quiet --sdist --no-build-isolation --out-dir dist netem
+	@$(SAY) "building noack's wheel" $(BIN)/uv build --quiet --wheel --no-build-isolation --out-dir dist dist/noack-*.tar.gz
 	@set -- $$($(BIN)/python native/build.py --platforms); number=0; \
 	for platform; do number=$$((number + 1)); \
-		NOACK_PLATFORM=$$platform $(SAY) "building wheel $$number of $$#, for $$platform" \
+		NOACK_PLATFORM=$$platform $(SAY) "building noack-netem's wheel $$number of $$#, for $$platform" \
 			$(BIN)/uv build --quiet --wheel --no-build-isolation --out-dir dist \
-			dist/noack-*.tar.gz || exit; done
+			dist/noack_netem-*.tar.gz || exit; done
 	@ls -s --block-size=K dist/*
 
 clean: ## Remove the environment and caches, not runs/
@@ -234,7 +236,7 @@ $(VENV)/.dependencies: requirements.lock | $(VENV)/bin/python
 core: $(VENV)/.dependencies
 	@$(BUILD_CORE)
 
-$(VENV)/.installed: $(VENV)/.dependencies pyproject.toml | core
+$(VENV)/.installed: $(VENV)/.dependencies pyproject.toml netem/pyproject.toml | core
 	@$(SAY) --late "installing noack" $(EDITABLE)
 	@# Else each process compiles its modules anew where PYTHONDONTWRITEBYTECODE is set.
 	@$(SAY) --late "compiling modules" $(BIN)/python -m compileall -q -j 0 noack netem cosim plant_server sensor_node controller_node

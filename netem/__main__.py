@@ -8,6 +8,7 @@
 
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from netem.core.command_line import stoppable_imports
 
@@ -55,6 +56,11 @@ def main(arguments: Sequence[str] | None = None, parser: Parser | None = None) -
         return report_failure(reason, ExitStatus.FAILED, source="noack netem", as_json=as_json)
 
 
-if __name__ == "__main__":
+def command() -> NoReturn:
+    """Run the command ``noack-netem``."""
     guard_streams(ignore_broken_pipes=False)  # the emulator ends when its output is closed
     sys.exit(main())
+
+
+if __name__ == "__main__":
+    command()

@@ -9,6 +9,7 @@ the impairments after their step.
 
 import math
 from collections.abc import Iterable
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -35,6 +36,12 @@ _WARM_UP = 100
 
 class NotPredictableError(Exception):
     """The loss rate cannot be predicted; the message is the reason."""
+
+
+def require_scipy() -> None:
+    """Raise NotPredictableError where scipy, which the emulator itself does not need, is missing."""
+    if find_spec("scipy") is None:
+        raise NotPredictableError("predictions need scipy: pip install 'noack-netem[measure]'")
 
 
 class Chain(NamedTuple):
@@ -186,8 +193,9 @@ def transitions_by_outcome(
         guarantee: the guarantee.
 
     Raises:
-        NotPredictableError: there are too many states.
+        NotPredictableError: there are too many states, or scipy is not installed.
     """
+    require_scipy()
     from scipy import sparse  # slow to import
 
     after_loss, after_delivery = reachable_transitions(guarantee, MOST_JOINT_STATES // len(transitions))

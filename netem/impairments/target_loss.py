@@ -28,7 +28,7 @@ from netem.impairments.loss_prediction import (
     order_and_notes,
     predict,
 )
-from netem.impairments.markov_chain import NotPredictableError
+from netem.impairments.markov_chain import NotPredictableError, require_scipy
 from netem.impairments.words import brief_percent
 
 _PARTS = 16
@@ -142,9 +142,12 @@ def _with_probability(settings: LinkSettings, target_loss: _TargetLoss, probabil
 
 
 def _probability(settings: LinkSettings, target_loss: _TargetLoss) -> float:
-    from scipy.optimize import brentq  # slow to import
-
     text, target = target_loss.impairment.text(), target_loss.loss.probability
+    try:
+        require_scipy()
+    except NotPredictableError as error:
+        raise ValueError(f"{text}: {error}") from None
+    from scipy.optimize import brentq  # slow to import
 
     def rate_at(probability: float, link_settings: LinkSettings = settings) -> float:
         rate, note = predict(_with_probability(link_settings, target_loss, float(probability)))

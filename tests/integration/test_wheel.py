@@ -1,172 +1,115 @@
-"""The built and installed package works without the repository."""
+"""The built and installed packages work without the repository."""
 
 import json
-import os
-import shutil
+import signal
 import subprocess
-import sys
-import tarfile
 import zipfile
-from dataclasses import dataclass
-from email import message_from_bytes
-from importlib.metadata import Distribution, distribution
 from pathlib import Path
-from typing import Any
 
 import pytest
-from packaging.requirements import Requirement
 
-from native.build import HEADER, INTO, LIBRARY
 from tests.helpers.live_runs import EPHEMERAL, PATIENCE_S
+from tests.integration.wheels import (
+    ENVIRONMENT,
+    ROOT,
+    Installed,
+    built,
+    content,
+    files_below,
+    install,
+    wheel_of_sdist,
+)
 
 pytestmark = [pytest.mark.system]
-ROOT = Path(__file__).parents[2]
-ENVIRONMENT = {
-    name: value
-    for name, value in os.environ.items()
-    if name not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
-}
+PACKAGES = (
+    "noack", "plant_server", "sensor_node", "controller_node", "cosim", "noack_kernel", "noack_gains",
+    "noack_equations", "noack_verify",
+)  # fmt: skip
+TEST = """
+import socket
 
-
-def uv(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    program = shutil.which("uv", path=str(Path(sys.executable).parent)) or shutil.which("uv")
-    if program is None:
-        pytest.skip("uv is not installed")
-    return subprocess.run(
-        [program, *map(str, arguments)], env=ENVIRONMENT, capture_output=True, text=True,
-        check=False, timeout=250,
-    )  # fmt: skip
-
-
-def built(*arguments: str | Path) -> Path:
-    """Build with the installed packages and without downloads; return the wheel."""
-    out = Path(arguments[-1])
-    done = uv("build", "--no-build-isolation", "--python", sys.executable, *arguments)
-    assert done.returncode == 0, done.stderr
-    (wheel,) = out.glob("*.whl")
-    return wheel
+def test_of_a_server(lossy_udp):
+    server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    server.bind(("127.0.0.1", 0))
+    server.settimeout(60)
+    link = lossy_udp(server.getsockname(), "loss 30% mansd 2")
+    client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    for _ in range(3):  # at most two are lost
+        client.sendto(b"x", link.address)
+    assert server.recv(10) == b"x"
+    client.close()
+    server.close()
+"""
 
 
 @pytest.fixture(scope="module")
-def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the sdist and the wheel built from it.
-
-    The core is given to it: it is built again only if the sdist has other sources.
-    """
-    out, into = tmp_path_factory.mktemp("dist"), tmp_path_factory.mktemp("sources")
-    done = uv("build", "--sdist", "--no-build-isolation", "--python", sys.executable, ROOT,
-              "--out-dir", out)  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    (sdist,) = out.glob("*.tar.gz")
-    with tarfile.open(sdist) as file:
-        file.extraction_filter = getattr(tarfile, "data_filter", None)  # Python 3.11.4 and later have it
-        file.extractall(into)
-    (sources,) = into.iterdir()
-    for name in (LIBRARY, HEADER):
-        shutil.copyfile(INTO / name, sources / "netem" / "core" / name)
-    built("--wheel", sources, "--out-dir", out)
-    return out
-
-
-@dataclass(frozen=True)
-class Installed:
-    """An environment with noack installed, and a working folder."""
-
-    program: Path
-    folder: Path
-
-    def __call__(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [self.program, *arguments], cwd=self.folder, env=ENVIRONMENT, capture_output=True,
-            text=True, check=False, timeout=PATIENCE_S,
-        )  # fmt: skip
-
-    def json(self, *arguments: str) -> dict[str, Any]:
-        done = self(*arguments, "--json")
-        assert done.returncode == 0, done.stderr
-        answer: dict[str, Any] = json.loads(done.stdout)
-        return answer
-
-
-def requirements(wheel: Path) -> list[Distribution]:
-    """Return the installed packages that a wheel needs without extras, also indirectly."""
-    with zipfile.ZipFile(wheel) as file:
-        (about,) = (name for name in file.namelist() if name.endswith(".dist-info/METADATA"))
-        texts = message_from_bytes(file.read(about)).get_all("Requires-Dist", [])
-    needed: dict[str, Distribution] = {}
-    waiting = [(Requirement(text), "") for text in texts]
-    while waiting:
-        requirement, extra = waiting.pop()
-        if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra}):
-            continue
-        new = requirement.name not in needed
-        installed = needed.setdefault(requirement.name, distribution(requirement.name))
-        assert requirement.specifier.contains(installed.version), requirement
-        extras = [*([""] if new else []), *requirement.extras]
-        waiting += [(Requirement(text), of) for text in installed.requires or () for of in extras]
-    return [*needed.values()]
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """noack's wheel, from its source distribution."""
+    return wheel_of_sdist(ROOT, tmp_path_factory.mktemp("noack"))
 
 
 @pytest.fixture(scope="module")
-def noack(dist: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """The wheel, in an environment that has the packages that it needs and no others."""
-    (wheel,) = dist.glob("*.whl")
-    place = tmp_path_factory.mktemp("clean")
-    python = place / "env" / "bin" / "python"
-    made = uv("venv", "--python", sys.executable, place / "env")
-    assert made.returncode == 0, made.stderr
-    (packages,) = (place / "env").glob("lib/python*/site-packages")
-    for package in requirements(wheel):
-        for name in {path.parts[0] for path in package.files or ()} - {"..", "__pycache__"}:
-            (packages / name).symlink_to(Path(str(package.locate_file(name))))
-    done = uv("pip", "install", "--python", python, "--offline", "--no-deps", wheel)
-    assert done.returncode == 0, done.stderr
-    (place / "work").mkdir()
-    return Installed(place / "env" / "bin" / "noack", place / "work")
+def netem_wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of the emulator alone."""
+    return wheel_of_sdist(ROOT / "netem", tmp_path_factory.mktemp("netem"), library="core")
 
 
-def test_the_sdist_makes_the_same_wheel_as_the_repository(dist: Path, tmp_path: Path) -> None:
-    (from_sdist,) = dist.glob("*.whl")
-    from_tree = built("--wheel", ROOT, "--out-dir", tmp_path)
-
-    def content(wheel: Path) -> dict[str, int]:
-        with zipfile.ZipFile(wheel) as file:
-            return {entry.filename: entry.CRC for entry in file.infolist()}
-
-    assert content(from_sdist) == content(from_tree)
+@pytest.fixture(scope="module")
+def noack(wheel: Path, netem_wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """Both wheels, in an environment that has the packages that they need and no others."""
+    return install(tmp_path_factory.mktemp("clean"), "noack", [wheel, netem_wheel])
 
 
-def test_the_wheel_contains_the_packages_and_their_data_only(dist: Path) -> None:
-    (wheel,) = dist.glob("*.whl")
-    with zipfile.ZipFile(wheel) as file:
-        names = set(file.namelist())
+@pytest.fixture(scope="module")
+def netem(netem_wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """The emulator alone, with pytest."""
+    return install(
+        tmp_path_factory.mktemp("netem"),
+        "noack-netem",
+        [netem_wheel],
+        also=("pytest", "pluggy", "iniconfig", "packaging"),
+    )
+
+
+@pytest.fixture(scope="module")
+def measuring(netem_wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """The emulator with what predicts and measures."""
+    return install(tmp_path_factory.mktemp("measure"), "noack-netem", [netem_wheel], "measure")
+
+
+def test_the_sdists_make_the_same_wheels_as_the_repository(
+    wheel: Path, netem_wheel: Path, tmp_path: Path
+) -> None:
+    assert content(wheel) == content(built(ROOT, tmp_path / "noack", "wheel"))
+    assert content(netem_wheel) == content(built(ROOT / "netem", tmp_path / "netem", "wheel"))
+
+
+def test_the_wheels_contain_the_packages_and_their_data_only(wheel: Path, netem_wheel: Path) -> None:
+    names = set(content(wheel))
     for folder in ("scenarios", "campaigns"):
         paths = (ROOT / folder).rglob("*")
         kept = {path for path in paths if path.suffix in (".toml", ".csv", ".md")}
         assert {f"cosim/{path.relative_to(ROOT)}" for path in kept} <= names
-    packages = (
-        "noack",
-        "plant_server",
-        "sensor_node",
-        "controller_node",
-        "netem",
-        "cosim",
-        "noack_kernel",
-        "noack_gains",
-        "noack_equations",
-        "noack_verify",
-    )
-    for package in packages:
+    for package in PACKAGES:
         root = ROOT / "checker" if (ROOT / "checker" / package).exists() else ROOT
-        files = {
-            str(path.relative_to(root))
-            for path in (root / package).rglob("*")
-            if path.is_file() and path.suffix not in (".pyc", ".nbi", ".nbc")
-        }
-        assert files <= names
-    (about,) = {name.partition("/")[0] for name in names} - set(packages)
-    assert about.endswith(".dist-info")
-    assert not [name for name in names if "__pycache__" in name]
+        assert files_below(root / package) <= names
+    of_netem = set(content(netem_wheel))
+    of_build = {"netem/README.md", "netem/pyproject.toml", "netem/hatch_build.py", "netem/LICENSE"}
+    assert files_below(ROOT / "netem") - of_build == {name for name in of_netem if ".dist-info" not in name}
+    for found, packages in ((names, PACKAGES), (of_netem, ("netem",))):
+        (about,) = {name.partition("/")[0] for name in found} - set(packages)
+        assert about.endswith(".dist-info")
+        assert not [name for name in found if "__pycache__" in name]
+
+
+def test_only_the_emulators_wheel_has_the_plugin_of_pytest(wheel: Path, netem_wheel: Path) -> None:
+    def entry_points(of: Path) -> str:
+        (name,) = (name for name in content(of) if name.endswith("entry_points.txt"))
+        with zipfile.ZipFile(of) as file:
+            return file.read(name).decode()
+
+    assert "pytest11" not in entry_points(wheel)
+    assert "netem.pytest_plugin" in entry_points(netem_wheel)
 
 
 def test_the_installed_wheel_runs_without_the_repository(noack: Installed) -> None:
@@ -183,3 +126,38 @@ def test_the_installed_wheel_runs_without_the_repository(noack: Installed) -> No
     assert noack("netem", "--explain", "loss", "5%").returncode == 0
     doctor = json.loads(noack("doctor", *EPHEMERAL, "--seconds", "0.1", "--json").stdout)
     assert doctor["measured"]["viewer"] is None
+
+
+def test_the_emulator_alone_relays(netem: Installed) -> None:
+    words = ("--listen", "127.0.0.1:0", "--to", "127.0.0.1:9", "--json", "loss", "30%", "mansd", "4")
+    with subprocess.Popen(
+        [netem.program, *words], cwd=netem.folder, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
+    ) as relay:
+        assert relay.stdout is not None
+        try:
+            assert json.loads(relay.stdout.readline())["ready"][0]["to"] == "127.0.0.1:9"
+        finally:
+            relay.send_signal(signal.SIGINT)
+        totals = json.loads(relay.communicate(timeout=PATIENCE_S)[0])
+    assert totals["links"][0]["forward"]["loss"]["predicted"] == pytest.approx(0.298, abs=1e-3)
+    assert relay.returncode == 0
+
+
+def test_the_emulator_alone_is_a_fixture_of_pytest(netem: Installed) -> None:
+    (netem.folder / "test_server.py").write_text(TEST)
+    done = netem.run(netem.python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_server.py")
+    assert (done.returncode, "1 passed" in done.stdout) == (0, True), done.stdout
+
+
+def test_the_emulator_alone_says_what_predictions_need(netem: Installed) -> None:
+    explained = netem("--explain", "loss", "gemodel", "1%", "10%", "mansd", "4")
+    assert (explained.returncode, explained.stderr) == (0, "")
+    assert "expected loss rate: 7.634%" in explained.stdout
+    kept = netem("--listen", "127.0.0.1:0", "--to", "127.0.0.1:9", "loss", "5%", "keep", "mansd", "4")
+    assert (kept.returncode, kept.stderr.count("\n")) == (2, 1)
+    assert "predictions need scipy: pip install 'noack-netem[measure]'" in kept.stderr
+
+
+def test_the_emulator_with_measure_predicts(measuring: Installed) -> None:
+    explained = measuring.json("--explain", "loss", "5%", "keep", "mansd", "4")
+    assert "pip install" not in json.dumps(explained)

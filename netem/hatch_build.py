@@ -1,4 +1,7 @@
-"""Builds the core for wheels and editable installations; hatchling calls it (pyproject.toml)."""
+"""Builds the library in C for wheels and editable installations; hatchling calls it (pyproject.toml).
+
+``native/`` is beside this folder in the repository, and in it in a source distribution.
+"""
 
 import os
 import re
@@ -34,15 +37,15 @@ class CoreHook(BuildHookInterface):
         """
         build = self._build()
         tag = os.environ.get("NOACK_PLATFORM")
-        folder = Path(tempfile.mkdtemp(prefix="noack-core-")) if tag else build["INTO"]
+        folder = Path(tempfile.mkdtemp(prefix="noack-core-")) if tag else Path(self.root) / "core"
         if tag is None:
-            build["build"]()
+            build["build"](folder)
             tag = _platform((folder / build["LIBRARY"]).read_bytes())
         else:
             build["build"](folder, target=tag)
             self._scratch = folder
         for name in (build["LIBRARY"], build["HEADER"]):
-            build_data["force_include"][str(folder / name)] = f"netem/core/{name}"
+            build_data["force_include"][str(folder / name)] = f"core/{name}"
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{tag}"
 
@@ -52,7 +55,9 @@ class CoreHook(BuildHookInterface):
             shutil.rmtree(self._scratch)
 
     def _build(self) -> dict[str, Any]:
-        return runpy.run_path(str(Path(self.root) / "native" / "build.py"))
+        root = Path(self.root)
+        within = root / "native" / "build.py"
+        return runpy.run_path(str(within if within.exists() else root.parent / "native" / "build.py"))
 
 
 def _platform(library: bytes) -> str:
