@@ -125,7 +125,7 @@ def test_each_setting_is_in_the_command_or_named(settings: LinkSettings) -> None
     if command.words is not None:
         kinds = ("loss", "delay", "duplicate", "corrupt", "reorder", "rate")
         kept = sum(command.words.split().count(kind) for kind in kinds)
-    own = ("lossrel", "mansd", "first", "atmost", "recover")
+    own = ("lossrel", "mansd", "first", "atmost", "recover", "ordered")
     left_out = [lack for lack in command.lacks if not lack.startswith(own)]
     assert kept + len(left_out) == len(wanted)
     assert (command.words is None) == (kept == 0 < len(wanted))

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 from click.testing import Result
-from tests.cosim.measurement.chains import chain_losses, trace_of
 
 import noack
 from cosim.measurement.network_section import trace_csv
@@ -13,6 +12,7 @@ from netem.core import toml_file
 from netem.measurement.chain_fits import ChainRates
 from noack.scenario.sections import NetworkSection
 from tests.helpers.command_line import invoke
+from tests.netem.measurement.chains import chain_losses, trace_of
 
 RURAL = Path(__file__).parents[3] / "netem/traces/shipped/cicv5g" / "rural_n8_10kmh.csv"
 IRTT = Path(__file__).parents[2] / "netem/traces" / "irtt.json"

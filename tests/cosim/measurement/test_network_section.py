@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
 
 import noack
 from cosim.measurement.network_section import trace_csv
@@ -15,6 +14,7 @@ from netem.measurement.loss_bursts import histogram
 from netem.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 from noack.scenario.sections import NetworkSection
 from tests.helpers.command_line import invoke
+from tests.netem.measurement.chains import PERIOD_NS, chain_losses, trace_of
 from tests.netem.stepped_link import Link
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cosim.measurement.chains import ELLIOTT, GILBERT, chain_losses
 
 from netem.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from netem.measurement.chain_fits import ChainFits, ChainRates, LossLikelihood
 from netem.measurement.loss_bursts import loss_bursts
+from tests.netem.measurement.chains import ELLIOTT, GILBERT, chain_losses
 
 chances = st.floats(0.01, 0.99)
 rates = st.builds(ChainRates, chances, chances, chances, chances)

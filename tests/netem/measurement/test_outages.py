@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.cosim.measurement.chains import chain_losses
 
 from netem.measurement import outages
 from netem.measurement.chain_fits import ChainRates
@@ -13,6 +12,7 @@ from netem.measurement.loss_bursts import loss_bursts
 from netem.measurement.network_measurement import MeasurementOptions, NetworkMeasurement
 from netem.measurement.outages import find_outages, fit_outages
 from netem.traces.packet_trace import read_trace
+from tests.netem.measurement.chains import chain_losses
 
 TRACES = Path(__file__).parents[3] / "netem/traces/shipped/cicv5g"
 
