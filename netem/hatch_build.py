@@ -15,7 +15,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
-class CoreHook(BuildHookInterface):
+class CoreHook(BuildHookInterface[Any]):
     """Adds the library and its declarations to a wheel."""
 
     PLUGIN_NAME = "custom"
