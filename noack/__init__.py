@@ -59,7 +59,7 @@ else:
 
             require_live_runs()
         value = getattr(import_module(module), name)
-        if value.__module__.startswith("cosim."):
+        if value.__module__.startswith(("cosim.", "netem.")):
             value.__module__ = __name__  # what `help(noack.simulate)` shows
         globals()[name] = value
         return value
