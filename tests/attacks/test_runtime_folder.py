@@ -18,7 +18,7 @@ import noack
 from cosim.doctor.machine_measures import _runtime_folder_problem
 from cosim.output.viewer.loop_recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
-from netem.control import control_server as emulator_session
+from netem.control import running_emulators as emulator_session
 from netem.core.errors import CallerError, MachineError, NoackError
 from netem.core.file_access import (
     create_file,
