@@ -94,7 +94,13 @@ def test_the_wheels_contain_the_packages_and_their_data_only(wheel: Path, netem_
         root = ROOT / "checker" if (ROOT / "checker" / package).exists() else ROOT
         assert files_below(root / package) <= names
     of_netem = set(content(netem_wheel))
-    of_build = {"netem/README.md", "netem/pyproject.toml", "netem/hatch_build.py", "netem/LICENSE"}
+    of_build = {
+        "netem/README.md",
+        "netem/pyproject.toml",
+        "netem/hatch_build.py",
+        "netem/LICENSE",
+        "netem/Containerfile",
+    }
     assert files_below(ROOT / "netem") - of_build == {name for name in of_netem if ".dist-info" not in name}
     for found, packages in ((names, PACKAGES), (of_netem, ("netem",))):
         (about,) = {name.partition("/")[0] for name in found} - set(packages)

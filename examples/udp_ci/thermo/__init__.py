@@ -1,0 +1,1 @@
+"""Temperatures over UDP: a server, and a client that repeats its question."""
