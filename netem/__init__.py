@@ -15,3 +15,16 @@ The program's options are in ``emulator_options.py``, words in ``tc_words.py``, 
 ``links_file.py``, ``--explain`` in ``explanation.py``. ``measurement`` stands beside all this: the N of
 real networks, from traces.
 """
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from netem.lossy_udp import LossyUdp as LossyUdp
+
+
+def __getattr__(name: str) -> object:
+    if name == "LossyUdp":  # imported when a program first uses it: the relay starts without it
+        from netem.lossy_udp import LossyUdp
+
+        return LossyUdp
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -35,8 +35,8 @@ class LossyUdp:
     again, here, from ``noack netem`` and from a file of links. How many datagrams a program sends
     may depend on its timers.
 
-    >>> import noack
-    >>> with noack.LossyUdp("127.0.0.1:9", "loss 30% mansd 4", seed=1) as link:
+    >>> import netem
+    >>> with netem.LossyUdp("127.0.0.1:9", "loss 30% mansd 4", seed=1) as link:
     ...     host, port = link.address
     ...     link.change("loss 50% mansd 4")
     >>> link.forward["received"]

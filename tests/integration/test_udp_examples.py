@@ -47,6 +47,13 @@ def test_each_step_of_the_workflow_passes(environment: Installed, tmp_path: Path
     assert (folder / "statistics.jsonl").read_text().count("\n") >= 1
 
 
+def test_the_page_shows_the_workflow_and_the_script() -> None:
+    page = (ROOT / "docs" / "netem-ci.md").read_text()
+    assert (EXAMPLES / "udp_ci" / ".github" / "workflows" / "test.yml").read_text() in page
+    script = (EXAMPLES / "udp_ci" / "through_losses.sh").read_text()
+    assert script[script.index("python -m thermo.server") :] in page
+
+
 def test_the_program_in_c_passes(environment: Installed, tmp_path: Path) -> None:
     if shutil.which("cc") is None or shutil.which("make") is None:
         pytest.skip("there is no C compiler, or no make")
