@@ -280,7 +280,7 @@ class MarginResult:
         proof = [] if self.proof is None else self.proof.lines
         texts = [
             self.verdict,
-            *self.timing_texts,
+            *self.condition_texts,
             *proof,
             *self.compared.relations,
             *period,
@@ -289,9 +289,23 @@ class MarginResult:
         return "\n".join([*texts, *self.certificate_texts])
 
     @property
-    def timing_texts(self) -> list[str]:
-        """What a live run may do at times that are nominally the same, in words."""
-        return [text for text in (self.ties, self.late_inputs) if text]
+    def condition_texts(self) -> list[str]:
+        """What the verdict rests on: its verification, and what a live run may do at equal nominal times."""
+        return [text for text in (self.unverified_text, self.ties, self.late_inputs) if text]
+
+    @property
+    def unverified_text(self) -> str:
+        """What of the verdict noack-check has not verified, as a sentence; empty if it has verified all."""
+        known = () if self.proof is None else self.caps
+        proven_m = max((cap.m for cap in known if "most" in cap.stability.entries), default=0)
+        last, whats = self.destabilised, list[str]()
+        if proven_m < (self.stable_m or 0):
+            whats.append(f"that M = {self.stable_m} is stable")
+        if last is not None and not (known and "least" in last.stability.entries):
+            whats.append(f"that M = {last.m} is destabilised")
+        if not whats:
+            return ""
+        return f"{' and '.join(whats)}: computed by noack with error bounds, not verified by noack-check"
 
     @property
     def random_text(self) -> str:
@@ -328,6 +342,7 @@ class MarginResult:
             "without_guarantee": growth if isinstance(growth, str) else growth._asdict(),
             "certificate": None if self.certificate is None else self.certificate._asdict(),
             "proof": None if self.proof is None else {"proven": self.proof.proven},
+            "unverified": self.unverified_text,
         }
 
 

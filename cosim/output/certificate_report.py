@@ -305,7 +305,7 @@ def _growth(growth: Stability) -> tuple[str, str]:
 def margin_document(margin: MarginResult) -> Document:
     """Return the bounds for each M, and the verdicts."""
     proof = [] if margin.proof is None else margin.proof.lines
-    texts = [margin.verdict, *margin.timing_texts, *proof, *margin.compared.relations]
+    texts = [margin.verdict, *margin.condition_texts, *proof, *margin.compared.relations]
     if margin.period is not None:
         texts.append(f"for {margin.guarantee}: {margin.period.text}")
     note = "D delivered, L lost, repeated. Below 1: every pattern is stable."
