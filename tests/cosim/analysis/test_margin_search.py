@@ -2,6 +2,7 @@
 
 import json
 import signal
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,11 @@ def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:
     assert margin.stable_m == 2
     assert "every M ≥ 2" in margin.verdict
     assert margin.to_json()["period"] is None
+    assert margin.unverified_text == ""
+    unverified = replace(margin, proof=None)
+    text = "that M = 2 is stable: computed by noack with error bounds, not verified by noack-check"
+    assert unverified.unverified_text == text
+    assert text in repr(unverified)
     with pytest.raises(noack.NoackError, match="most 0: expected at least 1"):
         noack.margin("lane_periodic", most_m=0)
 
