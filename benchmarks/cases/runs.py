@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import psutil
 
+from benchmarks.emulator_start import emulator_rows
 from benchmarks.machine_load import own_cpu_s
 from benchmarks.observed_runs import ObservedRun, observed_run
 from benchmarks.programs import PRIORITY, compile_program, execute, imported_s, noack, set_options
@@ -205,13 +206,14 @@ def started() -> Figures:
 
 @benchmark("startup", "Time to the first control step; the demo")
 def startup() -> Iterator[Row]:
-    """Start a short run, then 20 loops, and the demo; a certificate.
+    """Install the emulator alone; start a short run, then 20 loops, and the demo; a certificate.
 
     The alternative to a start is a Python that only imports the libraries that every process of a
     run needs; that of ``noack certify`` is one that only imports python-control, with which such
     loops are analysed. A plant step of the demo is late if it is made more than one period after its
     time.
     """
+    yield from emulator_rows()
     rounds = Rounds()
     libraries = "numpy, scipy.linalg, pydantic, zenoh"
     rounds.measure_in_turn(1, {OURS: started, IMPORTS: lambda: {"first_s": imported_s(libraries)}})
