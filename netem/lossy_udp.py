@@ -132,7 +132,7 @@ class LossyUdp:
         if unknown := [direction for direction in directions if direction not in DIRECTIONS]:
             raise CallerError(f"directions: {unknown[0]!r}; the directions are forward and reverse")
         commands, _ = self._running()
-        commands.change(self._spec.name, directions, _settings(words, "words"))
+        commands.change(self._spec.name, dict.fromkeys(directions, _settings(words, "words")))
 
     def __str__(self) -> str:
         """Where the link leads, its settings, and what was lost."""

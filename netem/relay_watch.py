@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 from netem.control.command_queue import CommandQueue
 from netem.control.emulator_statistics import Statistics, StatisticsThread
@@ -20,6 +21,9 @@ from netem.core.file_access import open_growing
 from netem.relay.relay import Relay
 from netem.relay.relay_reports import report_line
 
+if TYPE_CHECKING:
+    from netem.control.control_server import ControlAddresses
+
 _SWITCH_S = 0.0002
 """Maximum time for which another thread holds the interpreter lock before the relay's thread."""
 
@@ -27,7 +31,19 @@ _SWITCH_S = 0.0002
 def add_watching_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for what watches and changes a relay while it runs."""
     group = parser.add_argument_group("statistics and changes during operation")
-    group.add_argument("--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`")
+    group.add_argument("--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`, and HTTP")
+    group.add_argument(
+        "--control-port",
+        metavar="PORT",
+        type=int,
+        help="with --control: also accept HTTP with a token at 127.0.0.1:PORT; 0 takes a free port",
+    )
+    group.add_argument(
+        "--control-token",
+        metavar="FILE",
+        type=Path,
+        help="the token of that port (by default that in NOACK_NETEM_TOKEN, else a new one in NAME.token)",
+    )
     group.add_argument(
         "--stats",
         metavar="SECONDS",
@@ -48,20 +64,32 @@ def check_watching_options(options: argparse.Namespace) -> None:
     """Check the options of :func:`add_watching_options`; a file alone gets a line each second.
 
     Raises:
-        CallerError: the time between two lines is too short.
+        CallerError: the time between two lines is too short, a port is wrong, or an option is missing.
     """
+    if options.control_token is not None and options.control_port is None:
+        raise CallerError(f"--control-token {options.control_token}: also needs --control-port PORT")
+    if options.control_port is not None and options.control is None:
+        raise CallerError(f"--control-port {options.control_port}: also needs --control NAME")
+    if options.control_port is not None and not 0 <= options.control_port <= 65535:
+        raise CallerError(f"--control-port {options.control_port}: expected 0 to 65535")
     if options.stats is not None and not (math.isfinite(options.stats) and options.stats >= 0.01):
         raise CallerError(f"--stats {options.stats:g}: must be 0.01 s or more")
     if options.stats is None and options.stats_file is not None:
         options.stats = 1.0
 
 
-@contextmanager
-def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[CommandQueue]:
-    """Watch a relay within the context; the relay runs within it and is closed after it.
+class RelayWatch(NamedTuple):
+    """What watches a relay."""
 
-    Yields:
-        The commands of the threads that watch it, to be run in the relay's thread at least every 50 ms.
+    commands: CommandQueue
+    """The commands of the threads that watch it, to be run in the relay's thread at least every 50 ms."""
+    control: "ControlAddresses | None"
+    """Where requests are accepted, with ``--control``."""
+
+
+@contextmanager
+def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[RelayWatch]:
+    """Watch a relay within the context; the relay runs within it and is closed after it.
 
     Enter the context before the relay's thread applies real-time settings: new threads would
     inherit them.
@@ -74,14 +102,17 @@ def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[CommandQu
     with ExitStack() as stack:
         if options.stats is not None:
             stack.enter_context(_statistics_lines(commands, options.stats, options.stats_file))
+        control = None
         if options.control is not None:
-            from netem.control.control_server import ControlServer  # imports zenoh
+            from netem.control.control_server import TcpAccess, control_server  # the relay starts without it
 
-            stack.enter_context(ControlServer(options.control, commands))
+            port = options.control_port
+            tcp = None if port is None else TcpAccess(port, options.control_token)
+            control = stack.enter_context(control_server(options.control, commands, tcp))
         stack.callback(commands.close)
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_SWITCH_S)
-        yield commands
+        yield RelayWatch(commands, control)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import Protocol
@@ -123,16 +123,19 @@ def run_relay(
             relay = _open_relay(specs, options, None if program is None else program.devices)
             stack.callback(relay.close)
             signals = signal_stack.enter_context(Signals().handled())
-            commands = stack.enter_context(watch_relay(relay, options))
+            commands, control = stack.enter_context(watch_relay(relay, options))
             running = nullcontext(lambda: False) if program is None else program.running(signals)
             has_ended = stack.enter_context(running)
         # Relay.
         for setting, answer in stack.enter_context(realtime(options.realtime, _FIFO_PRIORITY)).items():
             if answer.startswith("not permitted"):
                 report_line(f"{setting} {answer}")
+        for line in () if control is None else control.lines():
+            report_line(line)
         takes_output = options.stats is not None and options.stats_file is None
         if program is None:
-            _report_ready(relay, print_it=not takes_output, as_json=options.json)
+            addresses = {} if control is None else {"control": control.document()}
+            _report_ready(relay, addresses, print_it=not takes_output, as_json=options.json)
         relay.run(lambda: signals.received is not None or has_ended(), commands.run_pending)
         return statistics(commands.snapshot_here())
 
@@ -159,10 +162,11 @@ def check_options(options: argparse.Namespace) -> None:
         raise CallerError(f"--stats-file {stats}: --links has the same file; choose another")
 
 
-def _report_ready(relay: Relay, *, print_it: bool, as_json: bool) -> None:
+def _report_ready(relay: Relay, control: Mapping[str, object], *, print_it: bool, as_json: bool) -> None:
     """Report on standard error that the relay runs, when Ctrl-C is handled already.
 
-    ``print_it``: also print a line on standard output that other programs can wait for.
+    ``print_it``: also print a line on standard output that other programs can wait for; as JSON with
+    ``control``, if there is one.
     """
     listen = {name: address_text(address) for name, address in relay.addresses().items()}
     for spec in relay.specs:
@@ -174,7 +178,7 @@ def _report_ready(relay: Relay, *, print_it: bool, as_json: bool) -> None:
             {"name": spec.name, "listen": listen[spec.name], "to": address_text(spec.to)}
             for spec in relay.specs
         ]
-        line = json.dumps({"ready": links})
+        line = json.dumps({"ready": links, **control})
     if print_it and sys.stdout is not None:
         with suppress(OSError, ValueError):  # no reader: the relay continues
             os.write(sys.stdout.fileno(), f"{line}\n".encode())

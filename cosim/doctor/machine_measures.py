@@ -22,12 +22,12 @@ import zenoh
 from cosim.live.disk_space import needed_bytes
 from cosim.output.viewer.rerun_program import has_display, is_installed
 from cosim.record.run_directory import environment
-from netem.control.zenoh_session import answer_to, cause_of, open_session
 from netem.core.clock import NS_PER_S
 from netem.core.errors import CallerError, MachineError, NoackError, one_line, why
 from netem.core.private_folder import open_private
 from netem.core.system_processes import python_command
 from noack.runtime.active_runs import RUNS
+from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 from noack.runtime.counting_sockets import bind
 from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario import Scenario

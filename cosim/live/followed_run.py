@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from zenoh.handlers import RingChannel
 
 from cosim.record.run_directory import SCENARIO_FILE
-from netem.control.zenoh_session import cause_of, header_of, open_session
 from netem.core.errors import CallerError, PeerError, did_you_mean
 from noack.protocol.record_tables import LOOP
 from noack.runtime.active_runs import RUNS, OpenRun, active_runs, find_run
+from noack.runtime.connections.zenoh_session import cause_of, header_of, open_session
 from noack.runtime.control_messages import LogLine, parse_message
 from noack.runtime.spool import NOTICES, lines_in
 from noack.scenario import scenario_file

@@ -144,8 +144,8 @@ class CommandQueue:
             time.time_ns(),
         )
 
-    def change(self, link: str, directions: Sequence[Direction], settings: LinkSettings) -> None:
-        """Change directions of a link, from another thread.
+    def change(self, link: str, changes: Mapping[Direction, LinkSettings]) -> None:
+        """Change directions of a link between two datagrams, from another thread.
 
         Raises:
             CallerError: the relay refuses the settings.
@@ -153,10 +153,10 @@ class CommandQueue:
         """
 
         def command() -> None:
-            for direction in directions:
+            for direction, settings in changes.items():
                 self._relay.change(link, direction, settings)
             (report,) = (link_report for link_report in self._relay.report() if link_report.name == link)
-            for direction in directions:
+            for direction, settings in changes.items():
                 counters = replace(getattr(report, direction).counters)
                 self._applied[link, direction] = AppliedSettings(settings, counters)
 

@@ -1,179 +1,143 @@
-"""Live control of a running emulator by zenoh: its queries.
+"""Live control of a running emulator: its servers, its name, and its token.
 
-It listens on a Unix socket beside its file (:mod:`netem.control.running_emulators`). Below
-``netem/NAME`` it answers ``report``, ``settings`` and ``change``, and publishes ``statistics`` once a
-second, as docs/netem-control.md describes, in a thread of its own. A query with a mistake is answered
-with one line, and changes nothing.
+It listens on a Unix socket beside its file (:mod:`netem.control.running_emulators`), and if asked to
+also on a loopback port, for requests with a token. Requests are answered in threads of their own, which
+reach the relay between two batches of datagrams.
 """
 
-import json
-import traceback
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from typing import Literal, Self
-
-import zenoh
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
-from zenoh import CongestionControl, Priority
-from zenoh.handlers import RingChannel
+import os
+import re
+import secrets
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import NamedTuple
 
 from netem.control.command_queue import CommandQueue
-from netem.control.emulator_statistics import Statistics, StatisticsThread
-from netem.control.running_emulators import EMULATORS, registered_emulator
-from netem.control.zenoh_session import cause_of, open_session
-from netem.core.errors import CallerError, MachineError, NoackError
-from netem.core.json_text import parse_json
-from netem.core.toml_file import brief
-from netem.impairments.link_settings import LinkSettings
-from netem.impairments.target_loss import with_target_loss
-from netem.relay.relay_reports import DIRECTIONS, Direction
-from netem.tc_words import settings_of, words_of
+from netem.control.control_routes import ControlRoutes
+from netem.control.emulator_statistics import StatisticsThread
+from netem.control.http_server import LOOPBACK, TcpHttpServer, UnixHttpServer, serving
+from netem.control.running_emulators import emulator_folder, registered_emulator, socket_path
+from netem.core.errors import CallerError, MachineError, why
+from netem.core.file_access import read_regular
+from netem.core.private_folder import PrivateFolder
 
-_PUBLISH_S = 1.0
-"""Time between two published statistics."""
-_QUERIES = 64
-"""Maximum number of waiting queries of each kind; a new query replaces the oldest."""
+TOKEN_VARIABLE = "NOACK_NETEM_TOKEN"
+"""Environment variable with the token, if no file is given."""
+_TOKEN = re.compile(r"[!-~]{16,256}")
+_RECENT_S = 1.0
+"""Time between two snapshots, from which recent rates are computed."""
 
 
-class SettingsChange(BaseModel):
-    """The content of a ``change`` query."""
+class TcpAccess(NamedTuple):
+    """A loopback port on which requests with a token are accepted."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    link: str | None = None
-    direction: Literal["forward", "reverse", "both"] = "forward"
-    words: str | list[str] | None = None
-    settings: LinkSettings | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if (self.words is None) == (self.settings is None):
-            raise ValueError("give words, or settings")
-        return self
+    port: int
+    """0 takes a free one."""
+    token_file: Path | None = None
+    """The file with the token; None: see :func:`read_token`."""
 
 
-class ControlServer:
-    """Answers queries about a relay, and changes it, within the context.
+class ControlAddresses(NamedTuple):
+    """Where a running emulator accepts requests."""
+
+    socket: Path
+    url: str | None
+    """Of the loopback port."""
+    token_file: Path | None
+    """The file with the token that was made for this port; None if there was one already."""
+
+    def document(self) -> Mapping[str, str | None]:
+        """Return the addresses for other programs."""
+        return {
+            "socket": str(self.socket),
+            "url": self.url,
+            "token_file": None if self.token_file is None else str(self.token_file),
+        }
+
+    def lines(self) -> Iterator[str]:
+        """Yield the addresses for people."""
+        yield f"control: curl --unix-socket {self.socket} http://localhost/links"
+        if self.url is not None:
+            token = "as given" if self.token_file is None else f"in {self.token_file}"
+            yield f"control: {self.url}, token {token}"
+
+
+def read_token(file: Path | None) -> str | None:
+    """Return the token of a file, or without one of the environment; None if there is none.
+
+    Raises:
+        CallerError: the file cannot be read, or the token is too short or has other characters.
+    """
+    if file is None:
+        source, token = f"${TOKEN_VARIABLE}", os.environ.get(TOKEN_VARIABLE)
+        if token is None:
+            return None
+    else:
+        source = f"--control-token {file}"
+        try:
+            token = read_regular(file, 2**20).decode("ascii", "replace").strip()
+        except (OSError, ValueError) as error:
+            raise CallerError(f"{source}: cannot be read: {why(error)}") from None
+    if not _TOKEN.fullmatch(token):
+        raise CallerError(f"{source}: a token has 16 to 256 letters, digits and signs, without spaces")
+    return token
+
+
+@contextmanager
+def control_server(
+    name: str, commands: CommandQueue, tcp: TcpAccess | None = None
+) -> Iterator[ControlAddresses]:
+    """Answer requests about a relay, and change it, within the context; yields where.
 
     Args:
         name: the emulator's name.
-        commands: gives access to the relay.
+        commands: give access to the relay.
+        tcp: also listen on a loopback port.
 
     Raises:
-        CallerError: the name is not allowed, or in use.
+        CallerError: the name is not allowed, or in use; so is the port; or the token is wrong.
         MachineError: the socket cannot be listened on.
     """
-
-    def __init__(self, name: str, commands: CommandQueue) -> None:
-        self._name = name
-        self._commands = commands
-        self._thread = StatisticsThread(commands, _PUBLISH_S, self._publish, poll=self._serve)
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            stack.enter_context(registered_emulator(self._name))
-            try:
-                self._session = open_session(EMULATORS, self._name, listen=True)
-            except zenoh.ZError as error:
-                raise MachineError(f"live control cannot be started: {cause_of(error)}") from None
-            stack.callback(self._session.close)
-            self._queryables = [
-                (self._session.declare_queryable(self._key(query), RingChannel(_QUERIES)), answer)
-                for query, answer in (
-                    ("report", lambda _: self._thread.current()),
-                    ("settings", self._settings),
-                    ("change", self._change),
-                )
-            ]
-            stack.enter_context(self._thread)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-    def _key(self, query: str) -> str:
-        return f"netem/{self._name}/{query}"
-
-    def _serve(self) -> None:
-        for queryable, answer in self._queryables:
-            while (query := queryable.try_recv()) is not None:
-                self._reply(query, answer)
-
-    def _publish(self, document: Statistics) -> None:
-        self._session.put(
-            self._key("statistics"),
-            json.dumps(document),
-            congestion_control=CongestionControl.DROP,
-            priority=Priority.BACKGROUND,
-        )
-
-    def _reply(self, query: zenoh.Query, answer: Callable[[dict[str, object]], object]) -> None:
-        try:
-            content = json.dumps(answer(_content(query)))
-            query.reply(query.key_expr, content)
-        except NoackError as error:
-            query.reply_err(str(error))
-        except Exception as error:
-            traceback.print_exc()
-            query.reply_err(f"internal error of the emulator: {error!r}")
-        finally:
-            query.drop()  # type: ignore[no-untyped-call]
-
-    def _settings(self, _: Mapping[str, object]) -> object:
-        links = [
-            {"name": link.name}
-            | {name: _settings_document(getattr(link, name).settings) for name in DIRECTIONS}
-            for link in self._commands.snapshot().links
-        ]
-        return {"links": links}
-
-    def _change(self, content: Mapping[str, object]) -> object:
-        try:
-            change = SettingsChange.model_validate_json(json.dumps(content))
-        except ValidationError as error:
-            raise CallerError(brief(error)) from None
-        settings = change.settings
-        if settings is None:
-            settings = settings_of(change.words or [])
-        _require_read(settings)
-        try:
-            with_target_loss(settings)
-        except ValueError as error:
-            raise CallerError(str(error)) from None
-        directions: Sequence[Direction] = DIRECTIONS if change.direction == "both" else (change.direction,)
-        self._commands.change(self._link(change.link), directions, settings)
-        return self._settings({})
-
-    def _link(self, name: str | None) -> str:
-        names = self._commands.links
-        if name is None and len(names) == 1:
-            return names[0]
-        if name is None:
-            raise CallerError(f"which link? Links: {', '.join(names)}")
-        if name not in names:
-            raise CallerError(f"no link {name!r}; links: {', '.join(names)}")
-        return name
+    token = None if tcp is None else read_token(tcp.token_file)
+    with ExitStack() as stack:
+        folder = stack.enter_context(emulator_folder(create=True))
+        stack.enter_context(registered_emulator(name))
+        statistics = stack.enter_context(StatisticsThread(commands, _RECENT_S))
+        routes = ControlRoutes(commands, statistics.current)
+        url = token_file = None
+        if tcp is not None:
+            made = token is None
+            token = token or secrets.token_urlsafe(32)
+            server = TcpHttpServer(tcp.port, token, routes)
+            _enter(stack, server, lambda error: CallerError(_port_problem(tcp.port, error)))
+            url = f"http://{LOOPBACK}:{server.server_port}"
+            token_file = _write_token(folder, name, token) if made else None
+        with suppress(FileNotFoundError):  # of an emulator that ended without removing it
+            folder.remove(f"{name}.sock")
+        unix = UnixHttpServer(socket_path(folder, name), routes)
+        _enter(stack, unix, lambda error: MachineError(f"live control cannot be started: {why(error)}"))
+        yield ControlAddresses(folder.path / f"{name}.sock", url, token_file)
 
 
-def _settings_document(settings: LinkSettings) -> object:
-    return {"words": words_of(settings), "settings": settings.model_dump(mode="json")}
-
-
-def _require_read(settings: LinkSettings) -> None:
-    for impairment in settings.impairments:
-        file = getattr(getattr(impairment, "loss", impairment), "file", None)
-        if file is not None:
-            raise CallerError(f"{file}: read the file first, and send its content as settings")
-
-
-def _content(query: zenoh.Query) -> dict[str, object]:
-    """Return the content of a query; raise CallerError unless it is a JSON object."""
+def _enter(
+    stack: ExitStack, server: TcpHttpServer | UnixHttpServer, error_of: Callable[[OSError], Exception]
+) -> None:
     try:
-        content = parse_json(query.payload.to_string() if query.payload else "{}")
-    except ValueError:
-        content = None
-    if not isinstance(content, dict):
-        raise CallerError("a query is a JSON object")
-    return content
+        stack.enter_context(serving(server))
+    except OSError as error:
+        raise error_of(error) from None
+
+
+def _port_problem(port: int, error: OSError) -> str:
+    return f"--control-port {port}: {why(error)}; choose another port, or 0 for a free one"
+
+
+def _write_token(folder: PrivateFolder, name: str, token: str) -> Path:
+    file_name = f"{name}.token"
+    try:
+        with os.fdopen(folder.create(file_name), "w") as file:
+            file.write(token + "\n")
+    except OSError as error:
+        raise MachineError(f"{folder.path / file_name}: cannot be written: {why(error)}") from None
+    return folder.path / file_name

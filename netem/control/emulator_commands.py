@@ -1,92 +1,29 @@
-"""The commands ``noack netem show``, ``set`` and ``watch``, and their client of live control.
-
-The client sends queries to a running emulator, and receives its statistics.
-"""
+"""The commands ``noack netem show``, ``set`` and ``watch`` for a running emulator."""
 
 import argparse
 import json
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any
 
-import zenoh
-from zenoh.handlers import RingChannel
-
+from netem.control.control_client import Client
 from netem.control.emulator_statistics import Statistics
-from netem.control.running_emulators import EMULATORS, find_emulator, running_emulators
+from netem.control.running_emulators import find_emulator, running_emulators
 from netem.control.statistics_text import statistics_lines
-from netem.control.zenoh_session import answer_to, cause_of, open_session
-from netem.core.command_line import Parser, Signals, discard_output, report_failure
-from netem.core.errors import CallerError, ExitStatus, NoackError, PeerError, why
+from netem.core.command_line import (
+    Parser,
+    StopRequestError,
+    discard_output,
+    report_failure,
+    stop_requests_raised,
+)
+from netem.core.errors import CallerError, ExitStatus, NoackError, why
 from netem.impairments.link_settings import LinkSettings
 from netem.impairments.target_loss import read_files
 from netem.relay.relay_reports import DIRECTIONS
 from netem.tc_words import guarantee_words, require_no_dashes, settings_of
-
-_ANSWER_S = 30.0
-"""Longest wait for the answer to a query."""
-_SILENCE_S = 3.0
-"""Time without statistics after which it is checked whether the emulator still runs."""
-_POLL_S = 0.02
-
-
-class Client:
-    """A connection to the running emulator of this name.
-
-    Raises:
-        PeerError: the emulator does not accept the connection.
-    """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        try:
-            self._session = open_session(EMULATORS, name, listen=False)
-        except zenoh.ZError as error:
-            raise PeerError(f"emulator {name!r} cannot be reached: {cause_of(error)}") from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._session.close()  # type: ignore[no-untyped-call]
-
-    def ask(self, query: str, **content: object) -> Any:
-        """Send the query ``report``, ``settings`` or ``change``, and return the answer.
-
-        Raises:
-            CallerError: the query has a mistake.
-            PeerError: there is no answer.
-        """
-        key = f"netem/{self._name}/{query}"
-        answer = answer_to(self._session, key, json.dumps(content), _ANSWER_S)
-        if answer is not None:
-            return json.loads(answer)
-        raise PeerError(f"emulator {self._name!r} does not answer")
-
-    def follow(self, stop: Callable[[], bool]) -> Iterator[Statistics]:
-        """Yield the statistics that the emulator publishes, until ``stop()``.
-
-        Raises:
-            PeerError: the emulator has ended.
-        """
-        key = f"netem/{self._name}/statistics"
-        with self._session.declare_subscriber(key, RingChannel(2)) as subscriber:
-            received_s = time.monotonic()
-            while not stop():
-                sample = subscriber.try_recv()
-                if sample is not None:
-                    received_s = time.monotonic()
-                    yield cast(Statistics, json.loads(sample.payload.to_string()))
-                elif time.monotonic() < received_s + _SILENCE_S:
-                    time.sleep(_POLL_S)
-                elif self._name not in running_emulators():
-                    raise PeerError(f"emulator {self._name!r} has ended")
-                else:
-                    received_s = time.monotonic()
-
 
 _NAME_HELP = "the emulator's --control NAME; optional if only one runs"
 
@@ -140,9 +77,7 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
     )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    name = _named_emulator(options)
-    with Client(name) as client:
-        statistics = client.ask("report")
+    statistics = Client(_named_emulator(options)).statistics()
     if options.json:
         print(json.dumps(statistics), flush=True)
     else:
@@ -169,23 +104,29 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     options.name, settings = _name_and_settings(options.words)
     settings = read_files(settings, Path())
     # Change the emulator, and show all settings afterwards.
-    with Client(_named_emulator(options)) as client:
-        earlier = client.ask("settings")
-        answer = client.ask(
-            "change",
-            link=options.link,
-            direction=options.direction,
-            settings=settings.model_dump(mode="json"),
-        )
+    client = Client(_named_emulator(options))
+    earlier = client.links()
+    table = settings.model_dump(mode="json")
+    directions = DIRECTIONS if options.direction == "both" else (options.direction,)
+    client.change(_link_name(options.link, earlier), **dict.fromkeys(directions, table))
+    later = client.links()
     if options.json:
-        print(json.dumps(answer), flush=True)
+        print(json.dumps({"links": later}), flush=True)
         return ExitStatus.OK
-    for link in answer["links"]:
+    for link in later:
         for direction in DIRECTIONS:
             words = link[direction]["words"] or "no impairment"
             print(f"{link['name']} {direction}: {words}", flush=True)
-    _warn_of_removed_caps(earlier["links"], answer["links"])
+    _warn_of_removed_caps(earlier, later)
     return ExitStatus.OK
+
+
+def _link_name(name: str | None, links: Sequence[Mapping[str, Any]]) -> str:
+    """Return the name of the link that changes; without one, of the only link."""
+    names = [str(link["name"]) for link in links]
+    if name is None and len(names) > 1:
+        raise CallerError(f"which link? Links: {', '.join(names)}")
+    return name or names[0]
 
 
 def _warn_of_removed_caps(earlier: Sequence[Mapping[str, Any]], later: Sequence[Mapping[str, Any]]) -> None:
@@ -233,9 +174,8 @@ def _watch(arguments: Sequence[str]) -> ExitStatus:
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
     show = _print_document if options.json else _print_lines
-    with Signals().handled() as signals, Client(_named_emulator(options)) as client:
-        show(client.ask("report"))
-        for statistics in client.follow(lambda: signals.received is not None):
+    with suppress(StopRequestError), stop_requests_raised():
+        for statistics in Client(_named_emulator(options)).follow():
             show(statistics)
     return ExitStatus.OK
 

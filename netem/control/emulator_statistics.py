@@ -2,7 +2,7 @@
 
 :func:`statistics` makes the document of two snapshots. Later versions may add keys, but remove
 none. Counts are totals since the relay started; ``recent`` covers the time since the previous
-document. :class:`StatisticsThread` passes documents to a consumer at intervals.
+document. :class:`StatisticsThread` takes snapshots at intervals, and passes documents to a consumer.
 """
 
 import math
@@ -291,33 +291,35 @@ def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:
     return {"p50": p50, "p99": p99, "p999": p999, "max": largest}
 
 
-_POLL_S = 0.02
 _JOIN_S = 10.0
 """Longest wait for the end of the thread."""
 
 
 class StatisticsThread:
-    """Calls ``show`` with new statistics at once and then every ``period_s``, within the context.
+    """Takes a snapshot at once and then every ``period_s``, within the context.
 
-    It calls ``poll`` every 20 ms. With ``at_end``, it shows the final statistics at the end of
-    the context; the relay must have ended by then.
+    Args:
+        commands: give access to the relay.
+        period_s: time between two snapshots.
+        show: is called with the statistics of each; None: they are only for :meth:`current`.
+        at_end: also show the final statistics at the end of the context; the relay must have ended
+            by then.
     """
 
     def __init__(
         self,
         commands: CommandQueue,
         period_s: float,
-        show: Callable[[Statistics], None],
+        show: Callable[[Statistics], None] | None = None,
         *,
-        poll: Callable[[], None] = lambda: None,
         at_end: bool = False,
     ) -> None:
         self._commands = commands
         self._period_s = period_s
         self._show = show
-        self._poll = poll
         self._at_end = at_end
         self._snapshots: deque[Snapshot] = deque(maxlen=2)
+        self._predicting = threading.Lock()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="statistics", daemon=True)
 
@@ -336,20 +338,21 @@ class StatisticsThread:
             PeerError: the relay has ended, or does not answer.
         """
         earlier = self._snapshots[0] if self._snapshots else None
-        return statistics(self._commands.snapshot(), earlier)
+        latest = self._commands.snapshot()
+        with self._predicting:  # a prediction may take seconds; several threads would each make it
+            return statistics(latest, earlier)
 
     def _run(self) -> None:
         due_s = time.monotonic()
-        while not self._stopping.wait(min(_POLL_S, max(due_s - time.monotonic(), 0))):
-            self._poll()
-            if time.monotonic() >= due_s:
-                due_s = max(due_s + self._period_s, time.monotonic())
-                with suppress(PeerError):
-                    self._show_next(self._commands.snapshot())
+        while not self._stopping.wait(max(due_s - time.monotonic(), 0)):
+            due_s = max(due_s + self._period_s, time.monotonic())
+            with suppress(PeerError):
+                self._take(self._commands.snapshot())
         if self._at_end:
-            self._show_next(self._commands.snapshot_here())
+            self._take(self._commands.snapshot_here())
 
-    def _show_next(self, snapshot: Snapshot) -> None:
+    def _take(self, snapshot: Snapshot) -> None:
         earlier = self._snapshots[-1] if self._snapshots else None
         self._snapshots.append(snapshot)
-        self._show(statistics(snapshot, earlier))
+        if self._show is not None:
+            self._show(statistics(snapshot, earlier))

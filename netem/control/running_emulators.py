@@ -61,7 +61,27 @@ def running_emulators() -> list[str]:
     Raises:
         CallerError: other users have access to the folder.
     """
-    return list(_files())
+    return [file.path.stem for file in private_folder.live_lock_files(EMULATORS)]
+
+
+@contextmanager
+def emulator_folder(*, create: bool = False) -> Iterator[private_folder.PrivateFolder]:
+    """Open the folder of the files, sockets and tokens of this user's emulators within the context.
+
+    Raises:
+        CallerError: the folder is not the user's own.
+        FileNotFoundError: it does not exist, and ``create`` is false.
+    """
+    with private_folder.open_private(EMULATORS, create=create) as folder:
+        yield folder
+
+
+def socket_path(folder: private_folder.PrivateFolder, name: str) -> str:
+    """Return the path of an emulator's socket for system calls.
+
+    It may have at most 107 bytes, so it goes through the descriptor of the open folder.
+    """
+    return f"/proc/self/fd/{folder.descriptor}/{name}.sock"
 
 
 def find_emulator(name: str | None) -> str:
@@ -71,8 +91,9 @@ def find_emulator(name: str | None) -> str:
         CallerError: there is no such emulator, or several run and none is named.
         PeerError: it is still starting.
     """
-    files = _files()
+    registered = running_emulators()  # before the files of those that start: they have both for a moment
     starting_names = [file.path.stem for file in private_folder.live_lock_files(_STARTING)]
+    files = [known for known in registered if known not in starting_names]
     if name not in files and (name in starting_names or (name is None and starting_names and not files)):
         raise PeerError(
             f"emulator {name or starting_names[0]!r} is starting; "
@@ -85,11 +106,7 @@ def find_emulator(name: str | None) -> str:
         )
     if name is None and len(files) > 1:
         raise CallerError(f"which emulator? Running: {', '.join(files)}")
-    name = name or next(iter(files))
+    name = name or files[0]
     if name not in files:
         raise CallerError(f"no emulator {name!r}; running: {', '.join(files)}")
     return name
-
-
-def _files() -> dict[str, private_folder.LockFile]:
-    return {file.path.stem: file for file in private_folder.live_lock_files(EMULATORS)}

@@ -6,9 +6,9 @@ the folder by his own, or by a link, replaces nothing that is in use.
 
 A lock file describes a running process and how to reach it. The process holds a lock on its file,
 which the system releases when the process ends. A file without a lock is stale, and the next reader
-removes it, and what zenoh left of the process's socket. Readers share their lock. Whoever adds or
-removes a name locks the folder meanwhile, so that the socket of a new process of this name is not
-removed.
+removes it, and what is left of the process's socket and token. Readers share their lock. Whoever
+adds or removes a name locks the folder meanwhile, so that the socket of a new process of this name
+is not removed.
 """
 
 import json
@@ -26,6 +26,8 @@ from netem.core.errors import CallerError, MachineError, why
 from netem.core.file_access import lock, open_folder
 
 _SUFFIX = ".json"
+_BESIDE = (".sock", ".sock.lock", ".token")
+"""Suffixes of what a process has beside its lock file: a socket, zenoh's lock of it, a token."""
 
 
 def private_folder() -> Path:
@@ -219,12 +221,12 @@ def _live_file(folder: PrivateFolder, name: str) -> LockFile | None:
 
 
 def _remove(folder: PrivateFolder, name: str, status: os.stat_result) -> None:
-    """Remove a file, and what is left of its process's socket, unless it was replaced."""
+    """Remove a file, and what is left of its process's socket and token, unless it was replaced."""
     with _locked(folder):
         if folder.remove_same(name, status):
-            for remnant in (socket := name.removesuffix(_SUFFIX) + ".sock", f"{socket}.lock"):
+            for suffix in _BESIDE:
                 with suppress(FileNotFoundError):
-                    folder.remove(remnant)
+                    folder.remove(name.removesuffix(_SUFFIX) + suffix)
 
 
 @contextmanager

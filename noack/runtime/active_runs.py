@@ -12,10 +12,10 @@ from typing import NamedTuple
 import zenoh
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from netem.control.zenoh_session import answer_to, cause_of, open_session
 from netem.core.errors import CallerError, PeerError
 from netem.core.private_folder import LockFile, live_lock_files, lock_file
 from netem.core.toml_file import brief
+from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 from noack.runtime.control_messages import ChangeReply, ChangeRequest, message_json, parse_message
 from noack.runtime.run_descriptor import RunAccess
 from noack.scenario.runtime_parameters import require_finite

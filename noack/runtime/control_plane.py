@@ -16,7 +16,12 @@ import zenoh
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
-from netem.control.zenoh_session import (
+from netem.core.errors import NoAnswerError, PeerError
+from netem.impairments.target_loss import store_probabilities
+from noack.protocol.roles import COORDINATOR
+from noack.runtime.active_runs import RUNS, run_name
+from noack.runtime.connections.credentials import access_control, no_connection, tls_settings
+from noack.runtime.connections.zenoh_session import (
     TlsEndpoint,
     cause_of,
     first_reply,
@@ -25,11 +30,6 @@ from netem.control.zenoh_session import (
     open_remote_session,
     open_session,
 )
-from netem.core.errors import NoAnswerError, PeerError
-from netem.impairments.target_loss import store_probabilities
-from noack.protocol.roles import COORDINATOR
-from noack.runtime.active_runs import RUNS, run_name
-from noack.runtime.connections.credentials import access_control, no_connection, tls_settings
 from noack.runtime.control_messages import ChangeAnnouncement, message_json, parse_message
 from noack.runtime.run_descriptor import RunAccess
 from noack.runtime.spool import writer_of

@@ -18,7 +18,7 @@ import noack
 from cosim.doctor.machine_measures import _runtime_folder_problem
 from cosim.output.viewer.loop_recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
-from netem.control import running_emulators as emulator_session
+from netem.control import running_emulators as emulators
 from netem.core.errors import CallerError, MachineError, NoackError
 from netem.core.file_access import (
     create_file,
@@ -84,8 +84,8 @@ USES: dict[str, Use] = {
     "join a run": lambda _: join(),
     "publish a run": lambda descriptor: active_runs.registered_run(descriptor, None).__enter__(),
     "find a run": lambda _: active_runs.find_run(),
-    "publish an emulator": lambda _: emulator_session.registered_emulator(EMULATOR).__enter__(),
-    "list emulators": lambda _: emulator_session.running_emulators(),
+    "publish an emulator": lambda _: emulators.registered_emulator(EMULATOR).__enter__(),
+    "list emulators": lambda _: emulators.running_emulators(),
 }
 
 
@@ -144,7 +144,7 @@ def test_a_run_without_a_usable_folder_is_refused(shared: Path) -> None:
     assert find_descriptor("default") is None
     with pytest.raises(CallerError, match="no run is active"):
         active_runs.find_run()
-    assert emulator_session.running_emulators() == []
+    assert emulators.running_emulators() == []
     assert not (shared / OWN).exists()
 
 

@@ -5,7 +5,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from netem.control.zenoh_session import label
+from noack.runtime.connections.zenoh_session import label
 from noack.runtime.control_messages import message_json
 
 

@@ -7,8 +7,8 @@ role in the environment's ``FROZEN``, if any, stops before it requests admission
 import os
 import signal
 
-from netem.control import zenoh_session
 from noack.runtime import end_reasons, join_run
+from noack.runtime.connections import zenoh_session
 
 LEASE_S = 2.0
 """A connection whose other end is silent for longer breaks."""

@@ -16,11 +16,11 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from cosim.live.coordination.change_requests import ChangeRequests
 from cosim.record.processes import kept_reports
-from netem.control.zenoh_session import header_of, next_payload
 from netem.core.clock import RunClock
 from netem.core.errors import CallerError, PeerError
 from netem.core.system_processes import cores
 from noack.protocol.roles import COORDINATOR, LOOP_ROLES, ROLES
+from noack.runtime.connections.zenoh_session import header_of, next_payload
 from noack.runtime.control_messages import (
     Admission,
     AdmissionRequest,

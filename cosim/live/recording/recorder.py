@@ -22,7 +22,6 @@ from cosim.record.decimation import is_long
 from cosim.record.processes import kept_reports, report_of, write_reports
 from cosim.record.rows import Rows, messages_in
 from cosim.record.run_directory import RECORDING_FILE, active_run
-from netem.control.zenoh_session import header_of
 from netem.core.clock import NS_PER_S
 from netem.core.command_line import END_SIGNALS, print_to_stderr
 from netem.core.core_library import core
@@ -38,6 +37,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.roles import LOOP_ROLES, RECORDER, Notice
+from noack.runtime.connections.zenoh_session import header_of
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.end_reasons import LAUNCHED_LOST_S, LAUNCHER_GONE

@@ -1,5 +1,5 @@
-"""Connections of a process with a run on another host.
+"""Connections of a process with its run, on this host or another one.
 
-``credentials.py`` has what a process needs for a session of zenoh by TLS
-(:mod:`netem.control.zenoh_session`).
+``zenoh_session.py`` opens sessions of zenoh over a Unix socket or TLS; ``credentials.py`` has what a
+process needs for TLS.
 """

@@ -3,13 +3,14 @@
 import json
 import socket
 from collections.abc import Callable
+from http import HTTPStatus
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
 import tomli_w
 
-from netem.control.control_server import ControlServer, SettingsChange
+from netem.control.control_routes import ControlRoutes, LinkChange
 from netem.core.errors import CallerError
 from netem.explanation import tc_command
 from netem.impairments.kinds.delay import SHAPES
@@ -20,7 +21,6 @@ from netem.tc_words import EXAMPLES as ANY_WORD
 from netem.tc_words import parse, settings_of, words_of
 from tests.fuzz.edits import NAMED, Choices, Vocabulary, damaged, edited, quoted, vocabulary, write_named
 from tests.fuzz.harness import refusal, workspace
-from tests.fuzz.plane import Query
 from tests.netem.control.fake_relay import FakeRelay
 from tests.netem.impairments.any_link_settings import words_can_say
 from tests.netem.impairments.feature_examples import CONSTRAINED, IMPAIRED
@@ -138,14 +138,13 @@ def links_input(choices: Choices) -> None:
                     assert settings_of(words_of(settings)) == settings
 
 
-_CONTROL_SCHEMA = vocabulary(SettingsChange.model_json_schema())
+_CONTROL_SCHEMA = vocabulary(LinkChange.model_json_schema())
 CONTROL_KNOWN = Vocabulary(_CONTROL_SCHEMA.keys, (*_CONTROL_SCHEMA.words, "up", "down", *EXAMPLES))
 BASES: list[dict[str, Any]] = [
-    {"link": "up", "direction": "both", "words": "loss 5% mansd 4"},
-    {"link": "down", "words": ["delay", "10ms", "2ms"]},
+    {"forward": "loss 5% mansd 4", "reverse": "delay 10ms 2ms"},
+    {"reverse": "delay 10ms 2ms"},
     {
-        "link": "up",
-        "settings": {
+        "forward": {
             "mansd": 3,
             "impairments": [
                 {"kind": "loss", "loss": {"model": "gilbert_elliott", "mean_loss": 0.1,
@@ -170,8 +169,8 @@ class _AtOnce:
     def links(self) -> list[str]:
         return [spec.name for spec in self.relay.specs]
 
-    def change(self, link: str, directions: Any, settings: LinkSettings) -> None:
-        for direction in directions:
+    def change(self, link: str, changes: Any) -> None:
+        for direction, settings in changes.items():
             self.relay.change(link, direction, settings)
 
     def snapshot(self) -> Any:
@@ -182,26 +181,24 @@ def control_input(choices: Choices) -> None:
     """A request is answered once; a refused one changes no settings."""
     if choices.below(4):
         base = json.loads(json.dumps(choices.choose(BASES)))
-        if "words" in base and choices.flag():
-            base["words"] = sentence(choices)
+        if choices.flag():
+            base[choices.choose(DIRECTIONS)] = sentence(choices)
         data = damaged(choices, json.dumps(edited(choices, base, CONTROL_KNOWN)).encode())
     else:
         data = choices.near(CONTROL_SEEDS, CONTROL_WORDS)
     commands = _AtOnce()
-    server = ControlServer("test", commands)  # type: ignore[arg-type]
+    routes = ControlRoutes(commands, lambda: None)  # type: ignore[arg-type, return-value]
     before = dict(commands.relay.settings)
-    query = Query("netem/test/change", data)
-    server._reply(query, server._change)  # type: ignore[arg-type]
-    assert query.answered == 1
-    if query.error is not None:
-        assert "an error of the emulator's own" not in query.error
-        assert query.error.isprintable()
+    answer = routes.answer("PATCH", "/links/up", data)
+    content = json.loads(answer.content)
+    if answer.status == HTTPStatus.BAD_REQUEST:
+        assert all(line.isprintable() for line in content["error"].splitlines())
         assert commands.relay.settings == before, "a refused request changed settings"
     else:
-        for link in json.loads(query.replies[0])["links"]:
-            for direction in DIRECTIONS:
-                settings = LinkSettings.model_validate_json(json.dumps(link[direction]["settings"]))
-                assert settings == commands.relay.settings[link["name"], direction]
+        assert answer.status == HTTPStatus.OK, content
+        for direction in DIRECTIONS:
+            settings = LinkSettings.model_validate_json(json.dumps(content[direction]["settings"]))
+            assert settings == commands.relay.settings["up", direction]
 
 
 PARSERS = {

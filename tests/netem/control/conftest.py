@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from netem.control.command_queue import CommandQueue
-from netem.control.control_server import ControlServer
+from netem.control.control_server import ControlAddresses, control_server
 from tests.netem.control.fake_relay import FakeRelay, running
 
 
@@ -30,7 +30,7 @@ def commands(relay: FakeRelay) -> Iterator[CommandQueue]:
 
 
 @pytest.fixture
-def server(commands: CommandQueue) -> Iterator[ControlServer]:
+def server(commands: CommandQueue) -> Iterator[ControlAddresses]:
     """The control server of an emulator named ``lab``."""
-    with ControlServer("lab", commands) as server:
-        yield server
+    with control_server("lab", commands) as addresses:
+        yield addresses

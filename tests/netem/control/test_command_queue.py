@@ -14,7 +14,7 @@ from tests.netem.control.fake_relay import FakeRelay
 def test_commands_run_in_the_thread_of_the_relay(relay: FakeRelay, commands: CommandQueue) -> None:
     """Their errors are raised at their callers."""
     commands.snapshot()
-    commands.change("up", ["forward"], settings_of("loss 50%"))
+    commands.change("up", {"forward": settings_of("loss 50%")})
     (thread,) = relay.threads
     assert thread != threading.get_ident()
     for error in (CallerError("no"), TimeoutError("its own")):

@@ -18,9 +18,12 @@ def test_attachments_end_with_the_relay(relay: FakeRelay, tmp_path: Path) -> Non
     threads = threading.active_count()
     file = tmp_path / "lines"
     interval = sys.getswitchinterval()
-    with watch_relay(
-        relay, options("--control", "lab", "--stats", "0.01", "--stats-file", str(file))
-    ) as commands:
+    with watch_relay(relay, options("--control", "lab", "--stats", "0.01", "--stats-file", str(file))) as (
+        commands,
+        control,
+    ):
+        assert control is not None
+        assert control.socket.is_socket()
         assert running_emulators() == ["lab"]
         assert sys.getswitchinterval() < interval
         for _ in range(3):
@@ -38,7 +41,7 @@ def test_a_full_disk_is_reported_and_the_relay_continues(relay: FakeRelay) -> No
     error = io.StringIO()
     with (
         redirect_stderr(error),
-        watch_relay(relay, options("--stats", "0.01", "--stats-file", "/dev/full")) as commands,
+        watch_relay(relay, options("--stats", "0.01", "--stats-file", "/dev/full")) as (commands, _),
     ):
         wait_for(lambda: commands.run_pending() or error.getvalue().endswith("\n"))
     assert "cannot be written to /dev/full (No space left" in error.getvalue()

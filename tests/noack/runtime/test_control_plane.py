@@ -13,16 +13,16 @@ import pytest
 import zenoh
 from zenoh.handlers import FifoChannel
 
-import netem.control.zenoh_session
+import noack.runtime.connections.zenoh_session
 import noack.runtime.control_plane
 import noack.runtime.join_run
 from cosim.live.coordination.coordinator import Coordinator
-from netem.control.zenoh_session import cause_of, label
 from netem.core.command_line import Signals
 from netem.core.errors import NoAnswerError, PeerError
 from netem.core.private_folder import private_folder
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.active_runs import RUNS, run_name
+from noack.runtime.connections.zenoh_session import cause_of, label
 from noack.runtime.control_messages import RunStart, parse_message
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_run import _request_admission
@@ -120,7 +120,7 @@ def test_another_user_can_neither_connect_nor_listen(
 def test_a_process_without_a_coordinator_says_so(
     descriptor: RunDescriptor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(netem.control.zenoh_session, "_CONNECT_MS", 200)
+    monkeypatch.setattr(noack.runtime.connections.zenoh_session, "_CONNECT_MS", 200)
     with pytest.raises(NoAnswerError, match=r"cannot reach the run's coordinator: (Unable|no connection)"):
         ControlPlane(descriptor, "plant")
     error = zenoh.ZError("Timeout! at /home/builder/.cargo/git/zenoh/orchestrator.rs:388.")

@@ -15,10 +15,10 @@ import zenoh
 from cosim.live.coordination import remote_access
 from cosim.live.coordination.credentials_folder import MARK
 from cosim.live.coordination.remote_access import ListenSettings, credentials
-from netem.control import zenoh_session
 from netem.core.errors import CallerError, MachineError, NoAnswerError, PeerError
 from noack.protocol.roles import COORDINATOR, LOOP_ROLES, RECORDER
 from noack.runtime.active_runs import run_name
+from noack.runtime.connections import zenoh_session
 from noack.runtime.connections.credentials import read_credentials
 from noack.runtime.control_messages import JoinRequest
 from noack.runtime.control_plane import ControlPlane
@@ -211,7 +211,7 @@ def test_a_process_refuses_a_run_with_other_certificates(
 def test_without_a_run_the_line_says_that_nothing_listens(
     settings: ListenSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("netem.control.zenoh_session._CONNECT_MS", 200)
+    monkeypatch.setattr("noack.runtime.connections.zenoh_session._CONNECT_MS", 200)
     with (
         credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario),
         pytest.raises(NoAnswerError, match="nothing listens there; has `noack record` ended"),

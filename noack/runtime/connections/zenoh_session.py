@@ -1,6 +1,6 @@
 """Sessions of zenoh over a Unix socket in the user's runtime directory, or TLS; requests and replies.
 
-Of a run's control plane, of the emulator's live control, and of the doctor's measurement of zenoh.
+Of a run's control plane, and of the doctor's measurement of zenoh.
 """
 
 import json
