@@ -1,10 +1,10 @@
 """The file of links: several links of one relay, as TOML; see :class:`LinksFile`."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
+from pydantic_core import to_json
 
 from netem.core import toml_file
 from netem.core.address import parse_address, parse_destination
@@ -21,7 +21,7 @@ def _settings(value: object) -> LinkSettings:
         return value
     if not isinstance(value, str):
         # Strict validation accepts lists for tuples only in JSON, so that this goes through JSON.
-        return LinkSettings.model_validate_json(json.dumps(value))
+        return LinkSettings.model_validate_json(to_json(value))
     try:
         return settings_of(value)
     except CallerError as error:

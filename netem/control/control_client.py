@@ -3,7 +3,7 @@
 import json
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from http.client import HTTPConnection, HTTPException
 from typing import Any, cast
 from urllib.parse import quote
@@ -14,6 +14,7 @@ from netem.core.errors import CallerError, PeerError
 
 _ANSWER_S = 30.0
 """Longest wait for an answer."""
+_POLL_S = 0.02
 
 
 class _UnixConnection(HTTPConnection):
@@ -56,13 +57,15 @@ class Client:
         """Return the present statistics."""
         return cast(Statistics, self._ask("GET", "/stats"))
 
-    def follow(self, period_s: float = 1.0) -> Iterator[Statistics]:
-        """Yield the statistics at once, and then every ``period_s``."""
+    def follow(self, period_s: float = 1.0, stop: Callable[[], bool] = lambda: False) -> Iterator[Statistics]:
+        """Yield the statistics at once, and then every ``period_s``, until ``stop()``."""
         due_s = time.monotonic()
-        while True:
+        while not stop():
+            if (wait_s := due_s - time.monotonic()) > 0:
+                time.sleep(min(wait_s, _POLL_S))
+                continue
+            due_s = time.monotonic() + period_s
             yield self.statistics()
-            due_s = max(due_s + period_s, time.monotonic())
-            time.sleep(max(due_s - time.monotonic(), 0))
 
     def _ask(self, method: str, path: str, content: object = None) -> Any:
         body = None if content is None else json.dumps(content, separators=(",", ":"))

@@ -12,13 +12,7 @@ from netem.control.control_client import Client
 from netem.control.emulator_statistics import Statistics
 from netem.control.running_emulators import find_emulator, running_emulators
 from netem.control.statistics_text import statistics_lines
-from netem.core.command_line import (
-    Parser,
-    StopRequestError,
-    discard_output,
-    report_failure,
-    stop_requests_raised,
-)
+from netem.core.command_line import Parser, Signals, discard_output, report_failure
 from netem.core.errors import CallerError, ExitStatus, NoackError, why
 from netem.impairments.link_settings import LinkSettings
 from netem.impairments.target_loss import read_files
@@ -174,8 +168,9 @@ def _watch(arguments: Sequence[str]) -> ExitStatus:
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
     show = _print_document if options.json else _print_lines
-    with suppress(StopRequestError), stop_requests_raised():
-        for statistics in Client(_named_emulator(options)).follow():
+    client = Client(_named_emulator(options))
+    with Signals().handled() as signals:
+        for statistics in client.follow(stop=lambda: signals.received is not None):
             show(statistics)
     return ExitStatus.OK
 

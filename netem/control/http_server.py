@@ -32,7 +32,7 @@ LOOPBACK = "127.0.0.1"
 HEAD_BYTES = 16 * 2**10
 """Largest head of a request, its first line and its headers."""
 BODY_BYTES = 4 * 2**20
-"""Largest body of a request: settings with tables of some 300,000 numbers."""
+"""Largest body of a request: settings with a table of some 300,000 numbers."""
 CONNECTIONS = 64
 """Largest number of connections of a server."""
 _REQUEST_S = 10.0
@@ -105,7 +105,7 @@ class _Arriving(io.RawIOBase):
         return received
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _ConnectionHandler(BaseHTTPRequestHandler):
     """One connection, with one request."""
 
     protocol_version = "HTTP/1.1"
@@ -212,7 +212,7 @@ class _HttpServer(ThreadingHTTPServer):
     address: str | tuple[str, int]
 
     def __init__(self, routes: ControlRoutes) -> None:
-        super().__init__(self.address, _Handler, bind_and_activate=False)  # type: ignore[arg-type]
+        super().__init__(self.address, _ConnectionHandler, bind_and_activate=False)  # type: ignore[arg-type]
         self.routes = routes
         self.check: TokenCheck | None = None
         self._places = threading.BoundedSemaphore(CONNECTIONS)

@@ -97,8 +97,7 @@ def parsed(text: str, source: str) -> Table:
 
 def validated(model: type[M], content: ReadTable, source: str) -> M:
     """Validate parsed content; raise CallerError with one line per mistake, named by ``source``."""
-    if _is_deeper(content, MOST_LEVELS):
-        raise CallerError(f"{source}: {TOO_DEEP}")
+    require_levels(content, source)
     try:
         text = json.dumps(content, default=_unfit)
     except TypeError as error:
@@ -110,6 +109,12 @@ def validated(model: type[M], content: ReadTable, source: str) -> M:
         return model.model_validate_json(text)
     except ValidationError as error:
         raise CallerError("\n".join(explain(error, source, model))) from None
+
+
+def require_levels(content: ReadTable, source: str) -> None:
+    """Raise CallerError if tables and lists are nested too deeply."""
+    if _is_deeper(content, MOST_LEVELS):
+        raise CallerError(f"{source}: {TOO_DEEP}")
 
 
 @cache
