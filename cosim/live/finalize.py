@@ -21,7 +21,7 @@ from cosim.analysis.claims.run_certificates import (
     expected_certificates,
     search_limit,
 )
-from cosim.analysis.conformance.trace import MOST_ITEMS
+from cosim.analysis.conformance.recorded_loop import MOST_STEPS
 from cosim.analysis.ideal_loop import ideal_loop_part
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay
@@ -69,7 +69,7 @@ _FEW_LOOPS = 4
 """A run with at most this number of loops also gets one report per loop."""
 _LEAST_LOOPS = 8
 """Smallest number of loops that are evaluated together."""
-_LEAST_ITEMS = 500
+_LEAST_STEPS = 250
 """Each loop of a run has so many steps compared with its loop document in all numbers."""
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are evaluated in less time than processes
@@ -274,7 +274,7 @@ def _evaluate_loops(
             own = known[key]
         claims = claims_of(record)
         claims.certificates, claims.most_work = own, search_limit(loops)
-        claims.most_items = max(MOST_ITEMS // loops, _LEAST_ITEMS)
+        claims.most_steps = max(MOST_STEPS // loops, _LEAST_STEPS)
         phase_ns = run.phases_ns[record.number]
         status, reason = int(ending.status), ending.reason
         summary = summarise_loop(record, status, reason, phase_ns)

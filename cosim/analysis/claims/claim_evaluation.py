@@ -28,7 +28,7 @@ from cosim.analysis.claims.reference_deviations import deviations
 from cosim.analysis.claims.run_certificates import RunCertificate
 from cosim.analysis.claims.run_evidence import ROUNDING, ClaimEnd, RunEvidence, Samples, earliest
 from cosim.analysis.conformance.common_end import common_end_ns, up_to_common_end
-from cosim.analysis.conformance.trace import MOST_ITEMS
+from cosim.analysis.conformance.recorded_loop import MOST_STEPS
 from cosim.analysis.summary.summary_model import NO_BOUND, Claim, ClaimCause, ClaimVerdict, ConformancePart
 from cosim.record.decimation import decimate
 from cosim.record.divergence import largest_reference
@@ -163,7 +163,7 @@ class RunClaims:
     """Those of the run's scenario, if they are known."""
     most_work: float = 0.0
     """Limit of the search for a witness; 0: only those are used that are known."""
-    most_items: int = MOST_ITEMS
+    most_steps: int = MOST_STEPS
     """So many steps are compared with a loop document in all numbers."""
 
     @cached_property
@@ -206,11 +206,12 @@ class RunClaims:
     ) -> RunEvidence:
         changes = [change.first_ns for change in changes_of(self._checked_record) if change.touches_claims]
         until_s = changes[0] * 1e-9 if changes else math.inf  # as the times of samples are computed
-        if record is not self._checked_record and (at_s := jump_s(self.record.scenario)) is not None:
+        is_moved = record is not self._checked_record
+        if is_moved and (at_s := jump_s(self.record.scenario)) is not None:
             until_s = min(until_s, at_s)
         until_s = min(until_s, first_load_change_s(self.record.scenario))
         return RunEvidence(
-            record, self.record, until_s, certificates, offset, self.most_work, self.most_items
+            record, self.record, until_s, certificates, offset, is_moved, self.most_work, self.most_steps
         )
 
     @property

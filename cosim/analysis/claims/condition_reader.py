@@ -8,7 +8,13 @@ from collections import deque
 import numpy as np
 
 from cosim.analysis.claims.observed_conditions import ObservedConditions, PacketLosses
-from cosim.analysis.conformance.input_origins import AppliedUpdate, SampledSeries, Times, plant_inputs
+from cosim.analysis.conformance.input_origins import (
+    AppliedUpdate,
+    PlantInputs,
+    SampledSeries,
+    Times,
+    plant_inputs,
+)
 from cosim.record.rows import messages_in
 from cosim.record.run_record import RunRecord
 from netem.core.clock import NS_PER_S
@@ -19,9 +25,12 @@ from noack.runtime.host_clocks import RECEIVED, allowed_lead_ns
 _PACKET_COLUMNS = ("fate", "head")
 
 
-def read_conditions(record: RunRecord) -> ObservedConditions:
-    """Read the conditions from the record of a run; missing updates and inputs count as late."""
-    scenario, inputs = record.scenario, plant_inputs(record)
+def read_conditions(record: RunRecord, inputs: PlantInputs | None = None) -> ObservedConditions:
+    """Read the conditions from the record of a run; missing updates and inputs count as late.
+
+    ``inputs``: those of its plant, if they are known.
+    """
+    scenario, inputs = record.scenario, inputs or plant_inputs(record)
     measured = record.columns(SENSOR_MEASUREMENT, "t_ns", "event")
     end_ns = max(0, *(record.last_ns(table) or 0 for table in (PLANT_STEP, SENSOR_MEASUREMENT)))
     is_event = measured["event"] != NO_SEQUENCE

@@ -1,8 +1,8 @@
 """The data that claims are checked against: signals, observed conditions, certificates."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,10 +14,11 @@ from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.observed_conditions import ObservedConditions, Reals
 from cosim.analysis.claims.run_certificates import RunCertificate, certificates_under, scheduled_certificates
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
-from cosim.analysis.conformance.common_end import common_end_ns
-from cosim.analysis.conformance.run_conformance import conformance
+from cosim.analysis.conformance.common_end import common_end_ns, up_to_common_end
+from cosim.analysis.conformance.input_origins import PlantInputs, plant_inputs
+from cosim.analysis.conformance.recorded_loop import MOST_STEPS, RecordedLoop
+from cosim.analysis.conformance.run_conformance import conformance_of_loop, reference_of_bounds
 from cosim.analysis.conformance.run_document import RunDocument
-from cosim.analysis.conformance.trace import MOST_ITEMS
 from cosim.analysis.conformance.verdicts import Conformance
 from cosim.analysis.scenario_certificates import quick_certificate
 from cosim.analysis.summary.signal_statistics import SampleFacts, signal_statistics
@@ -115,12 +116,12 @@ class RunEvidence:
     """The certificates under the scenario's schedule, if they are known."""
     offset: float = 0.0
     """‖x_r‖ of the set-point: x in deviations has the rounding errors of x."""
+    is_moved: bool = False
+    """Whether ``record`` is in deviations from a reference."""
     most_work: float = 0.0
     """Limit of the search for a witness; 0: only those are used that are known."""
-    most_items: int = MOST_ITEMS
+    most_steps: int = MOST_STEPS
     """So many steps are compared with a loop document in all numbers."""
-    _conformances: dict[int, Conformance] = field(default_factory=dict, init=False)
-    """Those that are known already, by the ``id`` of the document."""
 
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
@@ -198,17 +199,39 @@ class RunEvidence:
         late = [each.certificate for each in self.late or ()]
         return next((each.conditions for each in late if any(each is one for one in used)), None)
 
+    @cached_property
+    def _conformances(self) -> Mapping[int, Conformance | CallerError]:
+        """Whether the run is one of the certificates' loop documents, by the ``id`` of the document.
+
+        What is read of the record is needed no longer than this takes.
+        """
+        documents = [each.document for each in self.certificates if each.document is not None]
+        if not documents:
+            return {}
+        found: dict[int, Conformance | CallerError] = {}
+        whole_record = self.whole_record or self.record
+        record, reference = up_to_common_end(whole_record), reference_of_bounds(whole_record.scenario)
+        try:
+            recorded = RecordedLoop(record, self._inputs, self.until_s, self.most_steps)
+        except CallerError as error:
+            return {id(document): error for document in documents}
+        for document in documents:
+            try:
+                found[id(document)] = conformance_of_loop(recorded, document, reference)
+            except CallerError as error:
+                found[id(document)] = error
+        return found
+
     def conformance_of(self, document: RunDocument) -> Conformance:
-        """Return whether the run is one of a loop document, up to the end of what certificates claim.
+        """Return whether the run is one of a certificate's loop document, up to the end of what it claims.
 
         Raises:
             CallerError: the record cannot be compared with it.
         """
-        known = self._conformances
-        if id(document) not in known:
-            whole_record = self.whole_record or self.record
-            known[id(document)] = conformance(whole_record, document, self.until_s, self.most_items)
-        return known[id(document)]
+        found = self._conformances[id(document)]
+        if isinstance(found, CallerError):
+            raise found
+        return found
 
     def end_of(self, certificate: RunCertificate) -> ClaimEnd | None:
         """Return from when on the bounds of a certificate need not hold; None: they hold of the whole run."""
@@ -224,9 +247,14 @@ class RunEvidence:
         return earliest([not_one, self.first_gap])
 
     @cached_property
+    def _inputs(self) -> PlantInputs | None:
+        """The inputs of the plant; None if they are in deviations."""
+        return None if self.is_moved else plant_inputs(self.record)
+
+    @cached_property
     def observed(self) -> ObservedConditions:
         """The conditions under which the run took place."""
-        conditions = read_conditions(self.record)
+        conditions = read_conditions(self.record, self._inputs)
         if self.whole_record is None or not self.offset:
             return conditions
         return conditions._replace(safe_input=read_conditions(self.whole_record).safe_input)  # in deviations

@@ -18,15 +18,13 @@ for the signals p, which may change during the step; and u is in the hull of the
 computed in floating point, with tolerances relative to the sizes of the terms.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from fractions import Fraction
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-from scipy.linalg import expm
 from scipy.optimize import lsq_linear, nnls
 
+from cosim.analysis.conformance.document_numbers import TINY, DocumentNumbers, Flow, Split, Table, value
 from cosim.analysis.conformance.trace import Flags, Numbers, Trace
 from cosim.analysis.conformance.verdicts import Conformance, Failed, Failure
 from netem.core.clock import NS_PER_S
@@ -37,11 +35,10 @@ STATE, MOTION, INPUT, FACT = 1e-7, 1e-6, 1e-6, 1e-9
 CLOCK_NS = 2
 _MOST_HULLS = 60
 """Steps at which the hull of several inputs is tested; a single input is tested at all steps."""
-_TINY = 1e-12
-_PROJECTIONS, _PARTS = 60, 8
+_PROJECTIONS = 60
 _SMALLEST_EFFECT = 0.1
 """Directions in which signals have a smaller effect, in units of what counts as rounding, are left out."""
-Table = Mapping[str, Any]
+_NOTHING = np.zeros(0, np.int64)
 
 
 class RefutedError(Exception):
@@ -52,7 +49,7 @@ class RefutedError(Exception):
         self.failure = failure
 
 
-def compare(trace: Trace, document: Table) -> Conformance:
+def compare(trace: Trace, document: DocumentNumbers) -> Conformance:
     """Return whether a trace is a run of a document."""
     checked = _Checked(trace, document)
     failures: list[Failure] = []
@@ -64,39 +61,27 @@ def compare(trace: Trace, document: Table) -> Conformance:
     first = min(failures, key=lambda failure: failure.t_s, default=None)
     until_s = float(trace.t_ns[-1]) / NS_PER_S if first is None else first.t_s
     share = float(trace.is_sampled.mean()) if len(trace.items) else 1.0
-    return Conformance(document["name"], until_s, first, checked.edge_counts(), checked.clock_shares(), share)
-
-
-@dataclass
-class _Split:
-    """A motion ż = F z + B u + Σ c p with u in the hull of Uᵢ z."""
-
-    F: Matrix
-    B: Matrix
-    U: Sequence[Matrix]
-    columns: Matrix
-    rows: Sequence[Matrix]
+    name = document.table["name"]
+    return Conformance(name, until_s, first, checked.edge_counts(), checked.clock_shares(), share)
 
 
 class _Checked:
-    def __init__(self, trace: Trace, document: Table) -> None:
-        self._trace, self._document = trace, document
-        self._names = [coordinate["name"] for coordinate in document["coordinates"]]
-        self._noise = [i for i, c in enumerate(document["coordinates"]) if c.get("noise")]
-        self._states = [i for i in range(len(self._names)) if i not in self._noise]
-        self._locations = {location["name"]: location for location in document["locations"]}
-        self._edges = {edge["name"]: edge for edge in document["edges"]}
-        self._rows = {name: _matrix(rows) for name, rows in document["rows"].items()}
+    def __init__(self, trace: Trace, document: DocumentNumbers) -> None:
+        self._trace, self._document, self._states = trace, document, document.states
         self._clocks_ns, self._is_motion = trace.clocks_ns, trace.is_motion
-        self._t_s = trace.t_ns[trace.steps] / NS_PER_S
         self._largest = float(np.abs(trace.z[:, self._states]).max(initial=0.0)) or 1.0
         self._number = {name: number for number, name in enumerate(trace.names)}
+        # Items by name and kind, found at once: most names of a document do not occur in a trace.
+        kinds = 2 * trace.items + trace.is_motion
+        order = np.argsort(kinds, kind="stable")
+        ends = np.searchsorted(kinds[order], np.arange(2 * len(trace.names) + 1))
+        self._at = [order[first:last] for first, last in zip(ends[:-1], ends[1:], strict=True)]
 
     # The path.
 
     def path(self) -> None:
         """Require that the path begins at the start, has all steps, and that items follow each other."""
-        trace, start = self._trace, self._document["start"]
+        trace, start = self._trace, self._document.table["start"]
         self._require_start(start)
         sources, targets = (
             np.array([self._end(name, index, is_first=is_first) for name in trace.names for index in (0, 1)])
@@ -108,7 +93,7 @@ class _Checked:
         known = begins >= 0
         if (wrong := np.flatnonzero(~known | (begins != expected) | (ends < 0))).size:
             index = int(wrong[0])
-            name, t_s = trace.names[trace.items[index]], float(self._t_s[index])
+            name, t_s = trace.names[trace.items[index]], self._time_s(index)
             unknown = trace.unknown.get(name)
             place = name if unknown is None else unknown.transition.source
             raise RefutedError(Failure(t_s, Failed.EDGE, place, unknown=unknown))
@@ -125,31 +110,33 @@ class _Checked:
         )
         if steps[0] != 0 or steps[-1] != len(trace.t_ns) - 1:
             what = "the path does not have all steps of the record"
-            raise RefutedError(Failure(float(self._t_s[-1]), Failed.PATH, detail=what))
+            raise RefutedError(Failure(self._time_s(-1), Failed.PATH, detail=what))
 
     def _require_start(self, start: Table) -> None:
         """Require that z is that of the start, where its facts hold."""
         first = self._z(np.zeros(1, int))
-        Z, noise, z = _matrix(start["columns"]), first[0, self._noise], first[0, self._states]
+        Z, noise, z = self._document.start(), first[0, self._document.noise], first[0, self._states]
         expected = (Z @ np.append(1.0, noise))[self._states]
         if (np.abs(z - expected) > STATE * (1 + np.abs(expected))).any():
-            raise RefutedError(Failure(float(self._t_s[0]), Failed.JUMP, "start"))
+            raise RefutedError(Failure(self._time_s(0), Failed.JUMP, "start"))
         for fact in start["facts"]:
             self._require(np.zeros(1, int), self._holds(fact, first), Failed.FACT, "start", fact)
 
     def _place_number(self, name: str | None) -> int:
-        return -1 if name not in self._locations else list(self._locations).index(name)
+        return -1 if name is None else self._document.place_numbers.get(name, -1)
 
     def _end(self, name: str, is_motion: int, *, is_first: bool) -> int:
         """Return the number of the location in which an item begins or ends; −1: the document has none."""
         if is_motion:
             return self._place_number(name)
-        edge = self._edges.get(name)
+        edge = self._document.edges.get(name)
         return -1 if edge is None else self._place_number(edge["from" if is_first else "to"])
 
     def edges(self) -> None:
         """Require that edges are taken at their times, where their facts hold, and that z jumps to J z."""
-        self._require_all(self._edge, ((edge, self._taken(name)) for name, edge in self._edges.items()))
+        self._require_all(
+            self._edge, ((edge, self._taken(name)) for name, edge in self._document.edges.items())
+        )
 
     @staticmethod
     def _require_all(check: Callable[..., None], calls: Iterable[tuple[Any, Numbers]]) -> None:
@@ -170,11 +157,11 @@ class _Checked:
             return  # then the path is none
         name, clock, after = edge["name"], self._clocks_ns[at], self._clocks_ns[at + 1]
         if edge.get("when") is not None:
-            first, last = (_value(end) * NS_PER_S for end in edge["when"])
+            first, last = (value(end) * NS_PER_S for end in edge["when"])
             inside = (clock >= first - CLOCK_NS) & (clock <= last + CLOCK_NS)
             self._require_clock(at, inside, Failed.WHEN, name, clock, (first, last))
-        limit = self._locations[edge["to"]].get("clock")
-        end = np.inf if limit is None else _value(limit) * NS_PER_S
+        limit = self._document.locations[edge["to"]].get("clock")
+        end = np.inf if limit is None else value(limit) * NS_PER_S
         expected = {
             "zero": after == 0,
             "keeps": after == clock,
@@ -182,10 +169,10 @@ class _Checked:
         }
         self._require_clock(at, expected[edge["clock"]], Failed.CLOCK, name, after, (0, end))
         at = at[self._trace.is_sampled[at]]
-        z, then, J = self._z(at), self._z(at + 1), _matrix(edge["jump"])
+        z, then, J = self._z(at), self._z(at + 1), self._document.jump(name)
         for fact in edge["facts"]:
             self._require(at, self._holds(fact, z), Failed.FACT, name, fact)
-        room = STATE * (np.abs(z) @ np.abs(J).T + np.abs(then)) + _TINY * self._largest
+        room = STATE * (np.abs(z) @ np.abs(J).T + np.abs(then)) + TINY * self._largest
         near = np.abs(then - z @ J.T) <= room
         self._require(at, np.asarray(near[:, self._states].all(axis=1)), Failed.JUMP, name)
 
@@ -194,22 +181,20 @@ class _Checked:
     def locations(self) -> None:
         """Require of each location that its clock is within its limit, and that its facts hold."""
         self._require_all(
-            self._location, ((each, self._motions_of(name)) for name, each in self._locations.items())
+            self._location,
+            ((each, self._motions_of(name)) for name, each in self._document.locations.items()),
         )
 
     def _location(self, location: Table, at: Numbers) -> None:
         name, after = location["name"], self._clocks_ns[at + 1]
         moved = after - self._clocks_ns[at]
-        dt = (self._t_s[at + 1] - self._t_s[at]) * NS_PER_S
+        dt = self._lengths_s(at) * NS_PER_S
         self._require_clock(at, np.abs(moved - dt) <= CLOCK_NS, Failed.CLOCK, name, after, (0, np.inf))
         if location.get("clock") is not None:
-            limit = _value(location["clock"]) * NS_PER_S
+            limit = value(location["clock"]) * NS_PER_S
             self._require_clock(at, after <= limit + CLOCK_NS, Failed.LIMIT, name, after, (0, limit))
-        outside = [
-            i for i in self._states if self._names[i] not in (*location["coordinates"], *self._units())
-        ]
         at = at[self._trace.is_sampled[at]]
-        zero = np.abs(self._z(at)[:, outside]) <= STATE * self._largest
+        zero = np.abs(self._z(at)[:, self._document.outside(name)]) <= STATE * self._largest
         self._require(at, np.asarray(zero.all(axis=1)), Failed.ZERO, name)
         for fact in location["facts"]:
             for ends in (at, at + 1):
@@ -218,41 +203,41 @@ class _Checked:
     def motions(self) -> None:
         """Require that z moves as the motions say, for some signals, and that u is in their hull."""
         self._require_all(
-            self._motion, ((each, self._motions_of(name)) for name, each in self._locations.items())
+            self._motion,
+            ((each, self._motions_of(name)) for name, each in self._document.locations.items()),
         )
 
     def _motion(self, location: Table, at: Numbers) -> None:
-        split, at = self._split(location["motion"]), at[self._trace.is_sampled[at]]
+        motion, at = location["motion"], at[self._trace.is_sampled[at]]
+        if (split := self._document.split(motion)) is None:
+            raise RefutedError(Failure(0.0, Failed.MOTION, motion, "its corners have no common part"))
         self._require_all(
-            lambda check, here: check(location["name"], split, here), ((self._flows, at), (self._inputs, at))
+            lambda check, here: check(location, split, here), ((self._flows, at), (self._inputs, at))
         )
 
-    def _flows(self, name: str, split: _Split, at: Numbers) -> None:
-        dt_s, u = self._t_s[at + 1] - self._t_s[at], self._trace.u[self._trace.steps[at]]
-        for length in np.unique(np.round(dt_s, 9)):
-            here = at[np.round(dt_s, 9) == length]
-            n, m, k = len(split.F), split.B.shape[1], split.columns.shape[1]
-            whole = np.zeros((n + m + k, n + m + k))
-            whole[:n, :n], whole[:n, n : n + m], whole[:n, n + m :] = split.F, split.B, split.columns
-            moved = expm(whole * length)[:n]
+    def _flows(self, location: Table, split: Split, at: Numbers) -> None:
+        dt_s, u = self._lengths_s(at), self._trace.u[self._trace.rows[at]]
+        rounded_s = np.round(dt_s, 9)
+        for length in np.unique(rounded_s):
+            is_here = rounded_s == length
+            here, inputs = at[is_here], u[is_here]
+            flow = self._document.flow(location["motion"], float(length))
             now, then = self._z(here), self._z(here + 1)
-            inputs = u[np.round(dt_s, 9) == length]
-            rest = then - now @ moved[:, :n].T - inputs @ moved[:, n : n + m].T
+            rest = then - now @ flow.state.T - inputs @ flow.input.T
             scale = np.abs(now) @ np.abs(split.F).T + np.abs(inputs) @ np.abs(split.B).T
-            allowed = MOTION * length * scale + STATE * 1e-3 * np.abs(then) + _TINY * self._largest
-            columns = moved[self._states, n + m :]
-            varied = _variation(split, length)[self._states]
-            free = allowed[:, self._states]
-            explained = self._explained(rest[:, self._states], free, columns, varied, split, now, then)
-            self._require(here, explained, Failed.MOTION, name)
+            allowed = MOTION * length * scale + STATE * 1e-3 * np.abs(then) + TINY * self._largest
+            explained = self._explained(
+                rest[:, self._states], allowed[:, self._states], flow, self._states, split, now, then
+            )
+            self._require(here, explained, Failed.MOTION, location["name"])
 
     @staticmethod
     def _explained(
         rest: Vector,
         free: Vector,
-        columns: Matrix,
-        varied: Matrix,
-        split: _Split,
+        flow: Flow,
+        states: list[int],
+        split: Split,
         now: Vector,
         then: Vector,
     ) -> Flags:
@@ -262,6 +247,7 @@ class _Checked:
         a signal that varies has more or less than a constant one is free, too. Signals are found by
         projections in turn, on those that explain the rest and on those within their limits.
         """
+        columns, varied = flow.signals[states], flow.varied[states]
         if not columns.shape[1]:
             return np.asarray((np.abs(rest) <= free).all(axis=1))
         sizes = [[np.linalg.norm(z @ R.T, axis=1) for z in (now, then, then - now)] for R in split.rows]
@@ -276,36 +262,19 @@ class _Checked:
         explained[open_] = _reachable(effects, rest[np.ix_(open_, moved)] / unit)
         return explained
 
-    def _inputs(self, name: str, split: _Split, at: Numbers) -> None:
-        u = self._trace.u[self._trace.steps[at]]
+    def _inputs(self, location: Table, split: Split, at: Numbers) -> None:
+        name, u = location["name"], self._trace.u[self._trace.rows[at]]
         for ends in (at, at + 1):
             z = self._z(ends)
             corners = np.stack([z @ U.T for U in split.U])  # (corners, steps, m)
             scale = np.max([np.abs(z) @ np.abs(U).T for U in split.U], axis=0)
-            room = INPUT * scale + _TINY * self._largest
+            room = INPUT * scale + TINY * self._largest
             inside = (u >= corners.min(axis=0) - room) & (u <= corners.max(axis=0) + room)
             self._require(at, inside.all(axis=1), Failed.INPUT, name)
             if u.shape[1] > 1:
                 some = np.unique(np.linspace(0, len(at) - 1, min(len(at), _MOST_HULLS)).astype(int))
                 fits = np.array([_in_hull(corners[:, i], u[i], room[i]) for i in some])
                 self._require(at[some], fits, Failed.INPUT, name)
-
-    def _split(self, motion: str) -> _Split:
-        """Return the parts of a motion; raise RefutedError if its corners have no common part."""
-        corners = self._document["motions"][motion]
-        F = [_matrix(corner["matrix"]) for corner in corners]
-        U = [_matrix(corner["input"]) for corner in corners]
-        unknown = corners[0]["unknown"]
-        columns = np.hstack([_matrix(each["column"]) for each in unknown] or [np.zeros((len(F[0]), 0))])
-        rows = [_matrix(each["rows"]) for each in unknown]
-        if len(corners) == 1:  # then u is U z, and F has its part
-            return _Split(F[0], np.zeros((len(F[0]), len(U[0]))), U, columns, rows)
-        mean_F, mean_U = sum(F) / len(F), sum(U) / len(U)
-        differences = np.hstack([each - mean_U for each in U]), np.hstack([each - mean_F for each in F])
-        B = differences[1] @ np.linalg.pinv(differences[0])
-        if np.abs(B @ differences[0] - differences[1]).max(initial=0) > 1e-6 * (np.abs(mean_F).max() + _TINY):
-            raise RefutedError(Failure(0.0, Failed.MOTION, motion, "its corners have no common part"))
-        return _Split(np.asarray(mean_F - B @ mean_U), B, U, columns, rows)
 
     # The record.
 
@@ -314,52 +283,54 @@ class _Checked:
 
         At a step x and x_s are those before what happens then, and x_c is the one of the input from then on.
         """
-        if "x" not in self._document["readings"] or not np.isfinite(self._trace.readings["x"]).all():
-            raise RefutedError(Failure(float(self._t_s[0]), Failed.READING, detail="x"))
-        for name, parts in self._document["readings"].items():
+        readings = self._document.readings()
+        x_is_known = self._trace.is_recorded.all() and np.isfinite(self._trace.readings["x"]).all()
+        if "x" not in readings or not x_is_known:
+            raise RefutedError(Failure(self._time_s(0), Failed.READING, detail="x"))
+        for name, parts in readings.items():
             recorded = self._trace.readings[name]
-            for part in parts:
-                rows, places = (
-                    _matrix(part["rows"]),
-                    [self._number[p] for p in part["in"] if p in self._number],
-                )
-                is_here = self._is_motion & self._trace.is_sampled & np.isin(self._trace.items, places)
-                here = np.flatnonzero(is_here)
+            for rows, places in parts:
+                here = np.sort(np.concatenate([_NOTHING, *map(self._motions_of, places)]))
+                here = here[self._trace.is_sampled[here]]
                 at = here if name == "x_c" else here + 1
                 self._require_read(name, at, rows, recorded)
                 if name == "x":
                     self._require_read(name, here[:1], rows, recorded)
 
     def _require_read(self, name: str, at: Numbers, rows: Matrix, recorded: Vector) -> None:
-        found = recorded[self._trace.steps[at]]
+        found = recorded[self._trace.rows[at]]
         known = np.isfinite(found).all(axis=1)
         at, found = at[known], found[known]
         z = self._z(at)
-        room = STATE * (np.abs(found) + np.abs(z) @ np.abs(rows).T) + _TINY * self._largest
+        room = STATE * (np.abs(found) + np.abs(z) @ np.abs(rows).T) + TINY * self._largest
         near = np.abs(z @ rows.T - found) <= room
         self._require(at, near.all(axis=1), Failed.READING, "", name)
 
     def edge_counts(self) -> dict[str, int]:
         """Return how often each edge was taken."""
-        taken = np.bincount(self._trace.items[~self._is_motion], minlength=len(self._trace.names))
-        names = [name for name, edge in self._edges.items() if edge["to"] is not None]
-        return {name: int(taken[self._number[name]]) if name in self._number else 0 for name in names}
+        names = [name for name, edge in self._document.edges.items() if edge["to"] is not None]
+        return {name: len(self._taken(name)) for name in names}
 
     def clock_shares(self) -> dict[str, float]:
         """Return the largest share of each clock's limit."""
         found = {}
-        for name, location in self._locations.items():
+        for name, location in self._document.locations.items():
             at = self._motions_of(name)
-            if location.get("clock") is not None and _value(location["clock"]) > 0:
-                limit = _value(location["clock"]) * NS_PER_S
+            if location.get("clock") is not None and value(location["clock"]) > 0:
+                limit = value(location["clock"]) * NS_PER_S
                 found[name] = float(self._clocks_ns[at + 1].max(initial=0) / limit)
         return found
 
     # Parts.
 
-    def _units(self) -> list[str]:
-        decaying = self._document.get("decaying")
-        return [decaying["coordinate"] if decaying else "", self._document.get("constant") or ""]
+    def _time_s(self, at: int) -> float:
+        """Return the time of a state."""
+        return float(self._trace.t_ns[self._trace.steps[at]] / NS_PER_S)
+
+    def _lengths_s(self, at: Numbers) -> Vector:
+        """Return the lengths of items."""
+        first, last = (self._trace.t_ns[self._trace.steps[ends]] / NS_PER_S for ends in (at, at + 1))
+        return np.asarray(last - first)
 
     def _z(self, at: Numbers) -> Matrix:
         """Return z of states, (k, coordinates), which are before or after sampled items."""
@@ -367,23 +338,28 @@ class _Checked:
 
     def _motions_of(self, name: str) -> Numbers:
         """Return the items in which time passes in a location."""
-        return np.flatnonzero(self._is_motion & (self._trace.items == self._number.get(name, -1)))
+        return self._items_of(name, is_motion=True)
 
     def _taken(self, name: str) -> Numbers:
         """Return the items that are an edge."""
-        return np.flatnonzero(~self._is_motion & (self._trace.items == self._number.get(name, -1)))
+        return self._items_of(name, is_motion=False)
+
+    def _items_of(self, name: str, *, is_motion: bool) -> Numbers:
+        number = self._number.get(name)
+        return _NOTHING if number is None else self._at[2 * number + is_motion]
 
     def _holds(self, fact: str, z: Vector) -> Flags:
+        facts = self._document.table["facts"][fact]
         left, right = (
-            sum((np.square(z @ self._rows[name].T).sum(axis=1) for name in names), np.zeros(len(z)))
-            for names in (self._document["facts"][fact]["less"], self._document["facts"][fact]["more"])
+            sum((np.square(z @ self._document.rows(name).T).sum(axis=1) for name in names), np.zeros(len(z)))
+            for names in (facts["less"], facts["more"])
         )
-        return np.asarray(left <= right * (1 + FACT) + _TINY**2)
+        return np.asarray(left <= right * (1 + FACT) + TINY**2)
 
     def _require(self, at: Numbers, holds: Flags, kind: Failed, place: str, detail: str = "") -> None:
         if not holds.all():
             first = at[int(np.argmin(holds))]
-            raise RefutedError(Failure(float(self._t_s[first]), kind, place, detail))
+            raise RefutedError(Failure(self._time_s(first), kind, place, detail))
 
     def _require_clock(
         self,
@@ -397,7 +373,7 @@ class _Checked:
         if not holds.all():
             first = int(np.argmin(holds))
             found, low, high = (float(value) / NS_PER_S for value in (clock_ns[first], *allowed_ns))
-            raise RefutedError(Failure(float(self._t_s[at[first]]), kind, place, "", found, low, high))
+            raise RefutedError(Failure(self._time_s(at[first]), kind, place, "", found, low, high))
 
 
 def _reachable(effects: Vector, rest: Vector) -> Flags:
@@ -429,35 +405,9 @@ def _reachable(effects: Vector, rest: Vector) -> Flags:
     return found
 
 
-def _variation(split: _Split, length_s: float) -> Matrix:
-    """Return by how much a varying signal of size 1 may move z otherwise than a constant one, (n, signals).
-
-    Its effect is ∫ g p ds with g = e^{F(T − s)} c, so this is ∫ |g − mean of g| ds.
-    """
-    parts = np.linspace(0.0, length_s, 2 * _PARTS + 1)[1::2]
-    effects = np.stack([expm(split.F * s) @ split.columns for s in parts])
-    return np.asarray(length_s * np.abs(effects - effects.mean(axis=0)).mean(axis=0))
-
-
 def _in_hull(corners: Matrix, u: Vector, room: Vector) -> bool:
     """Return whether u is near a mixture of corners, (corners, m)."""
     weights = np.vstack([corners.T / room[:, None], np.full(len(corners), 1e6)])
     target = np.append(u / room, 1e6)
     rest = weights @ nnls(weights, target)[0] - target
     return bool(np.abs(rest[:-1]).max() <= 2.0)
-
-
-def _value(entry: Any) -> float:
-    if isinstance(entry, list):
-        return (_value(entry[0]) + _value(entry[1])) / 2
-    return float(Fraction(entry)) if isinstance(entry, str) else float(entry)
-
-
-def _matrix(rows: Sequence[Sequence[Any]]) -> Matrix:
-    try:
-        plain = np.array(rows, dtype=float)
-    except ValueError:  # it has quotients or intervals
-        plain = np.zeros(0)
-    if plain.ndim == 2:
-        return plain
-    return np.array([[_value(entry) for entry in row] for row in rows], dtype=float)

@@ -85,6 +85,8 @@ class PlantInputs(NamedTuple):
     """Time of the first input of a controller with a state; infinite if there was none."""
     updates: list[AppliedUpdate]
     """In the order in which they were received."""
+    t_ns: Times
+    """Time of each step of the plant, (k,)."""
     actuation: Times
     """Newest actuation of each step, (k,); ``NO_SEQUENCE`` before the first one."""
     input_ns: Times
@@ -130,6 +132,7 @@ def plant_inputs(record: RunRecord) -> PlantInputs:
         safe_input=SampledSeries(step_s[safe], sizes[safe]),
         start_s=float(step_s[np.argmax(controlled)]) if controlled.any() else np.inf,
         updates=[*map(AppliedUpdate, sequence.tolist(), model_ns.tolist(), applied_ns)],
+        t_ns=t_ns,
         actuation=newest,
         input_ns=input_ns,
         is_controlled=is_held,

@@ -1,14 +1,14 @@
 """The conformance of a recorded loop with the loop document of its scenario's bounds."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
 from cosim.analysis.conformance.common_end import up_to_common_end
 from cosim.analysis.conformance.conformance import compare
+from cosim.analysis.conformance.recorded_loop import RecordedLoop
 from cosim.analysis.conformance.run_document import RunDocument, document_of_statement
-from cosim.analysis.conformance.trace import MOST_ITEMS, trace_of
+from cosim.analysis.conformance.trace import trace_of
 from cosim.analysis.conformance.verdicts import Conformance
 from cosim.analysis.loop_files import naming_of, widest
 from cosim.analysis.witnesses import WitnessedStatement, find_witnesses, plants_of
@@ -58,30 +58,42 @@ def conformance_with(record: RunRecord, statement: WitnessedStatement) -> Confor
     return conformance(record, document)
 
 
-def conformance(
-    record: RunRecord, document: RunDocument, until_s: float = math.inf, most_items: int = MOST_ITEMS
-) -> Conformance:
-    """Return whether a recorded loop is a run of a document, up to a time.
+def conformance(record: RunRecord, document: RunDocument) -> Conformance:
+    """Return whether a recorded loop is a run of a document.
 
     Args:
         record: of the loop; of a stopped run, it is compared up to its common end.
         document: of the loop.
-        until_s: end of the comparison.
-        most_items: so many steps are compared in all numbers, see :func:`trace_of`.
 
     Raises:
         CallerError: the record cannot be compared with the document; the message says why.
     """
-    until_ns = None if until_s == math.inf else round(until_s * NS_PER_S)
-    reference = reference_of_bounds(record.scenario)
-    trace = trace_of(up_to_common_end(record), document, reference, until_ns, most_items)
-    found = compare(trace, document.table)
+    recorded = RecordedLoop(up_to_common_end(record))
+    return conformance_of_loop(recorded, document, reference_of_bounds(record.scenario))
+
+
+def conformance_of_loop(
+    recorded: RecordedLoop, document: RunDocument, reference: Reference | None
+) -> Conformance:
+    """Return whether a recorded loop is a run of a document.
+
+    Args:
+        recorded: what is read of its record.
+        document: of the loop.
+        reference: what the bounds are about.
+
+    Raises:
+        CallerError: the record cannot be compared with the document; the message says why.
+    """
+    trace = trace_of(recorded, document, reference)
+    found = compare(trace, document.numbers)
     if (failure := found.failure) is None:
         return found
     step = int(np.searchsorted(trace.t_ns, round(failure.t_s * NS_PER_S)))
+    age_s = float(trace.t_ns[step] - recorded.inputs.input_ns[step]) / NS_PER_S
     sources = {edge["name"]: edge["from"] for edge in document.table["edges"]}
     at = document.places.get(sources.get(failure.place, failure.place))
-    return found._replace(failure=replace(failure, at=at, input_age_s=float(trace.input_ages_s[step])))
+    return found._replace(failure=replace(failure, at=at, input_age_s=age_s))
 
 
 def reference_of_bounds(scenario: Scenario) -> Reference | None:

@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from flint import fmpq
 
+from cosim.analysis.conformance.document_numbers import DocumentNumbers
 from cosim.analysis.conformance.verdicts import EdgeKind, Place, Transition
 from cosim.analysis.witnesses import WitnessedStatement
 from netem.core.clock import NS_PER_S
@@ -67,6 +69,11 @@ class RunDocument:
     is_periodic: bool
     is_by_tests: bool
     """A location says how many tests ago the updates on their way were sent."""
+
+    @cached_property
+    def numbers(self) -> DocumentNumbers:
+        """The document as numbers: runs of equal loops share them."""
+        return DocumentNumbers(self.table)
 
 
 def document_of_statement(statement: WitnessedStatement, naming: Naming) -> RunDocument:

@@ -11,18 +11,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.conformance.input_origins import PlantInputs, plant_inputs
+from cosim.analysis.conformance.recorded_loop import Flags, Numbers, RecordedLoop
 from cosim.analysis.conformance.run_document import RunDocument
 from cosim.analysis.conformance.verdicts import EdgeKind, Place, Transition, Unknown
-from cosim.record.run_record import RunRecord
-from netem.core.clock import NS_PER_S
-from netem.core.errors import CallerError
+from cosim.record.rows import Rows
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
 from noack.core.linear_systems import Propagator, Vector
 from noack.core.references import Reference
-from noack.protocol.record_tables import CONTROLLER_STEP, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import NO_SEQUENCE
 
-Numbers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
+Indices = NDArray[np.int32]
+"""Numbers of items, states or steps: half as large, as a long run has many."""
 _PROJECTIONS = 200
 _BETWEEN = 1.5
 """A rule whose tests are further apart than this share of the measurements' period skips measurements."""
@@ -30,8 +30,6 @@ _ROUNDED_NS = 2
 """Times of steps differ from exact ones by at most this."""
 _NONE = -1
 """Stands for no event."""
-MOST_ITEMS, _WINDOW = 25_000, 50
-"""Items of a trace of which z is known, at most, and consecutive ones of these."""
 _STAGES = 3
 """States of a step of the plant: after the motion to it, after an update began to act, and after a test."""
 _MOVED, _ACTED, _TESTED = range(_STAGES)
@@ -43,30 +41,30 @@ class Trace:
 
     names: list[str]
     """Names of locations and edges."""
-    items: Numbers
+    items: Indices
     """(k,) Each item's place in ``names``: of the location in which time passes, or of the edge."""
     is_motion: Flags
     """(k,) Whether time passes, or an edge is taken."""
-    steps: Numbers
+    steps: Indices
     """(k + 1,) The plant's step of each state."""
     clocks_ns: Numbers
     """(k + 1,)"""
     is_sampled: Flags
     """(k,) Of which items z is known before and after; of a long run a part."""
-    rows: Numbers
+    rows: Indices
     """(k + 1,) The place of each state in ``z``; −1: it is not known."""
     z: Vector
     """(known states, coordinates)"""
     t_ns: Numbers
     """(steps,) Times of the plant's steps."""
+    is_recorded: Flags
+    """(steps,) Whether x is."""
     u: Vector
-    """(steps, m) The input as it was recorded, minus that of the reference for its time."""
+    """(known states, m) The input as it was recorded, minus that of the reference for its time."""
     readings: dict[str, Vector]
-    """(steps, rows) each: what was recorded of x, and of x_s and x_c. NaN: nothing at this step."""
+    """(known states, rows) each: what was recorded of x, and of x_s and x_c. NaN: nothing at this step."""
     unknown: dict[str, Unknown] = field(default_factory=dict)
     """What happened at edges that the document lacks, by the name in ``names``."""
-    input_ages_s: Vector = field(default_factory=lambda: np.zeros(0))
-    """(steps,) Ages of the inputs at the steps; they may be below 0."""
 
 
 class _LocationChange(NamedTuple):
@@ -84,74 +82,47 @@ class _LocationChange(NamedTuple):
     edge: str = ""
 
 
-def trace_of(
-    record: RunRecord,
-    document: RunDocument,
-    reference: Reference | None = None,
-    until_ns: int | None = None,
-    most_items: int = MOST_ITEMS,
-) -> Trace:
+def trace_of(recorded: RecordedLoop, document: RunDocument, reference: Reference | None = None) -> Trace:
     """Return the trace of a recorded loop.
 
     Args:
-        record: of the loop.
+        recorded: what is read of its record.
         document: of the loop.
         reference: in whose coordinates the document is; None: 0.
-        until_ns: end of the trace; None: the end of the record.
-        most_items: so many items have z before and after; of a longer trace some at a time, evenly spread.
 
     Raises:
-        CallerError: the document has parts that the record does not show, or the record is too short.
+        CallerError: the document has parts that the record does not show.
     """
-    return _Tracer(record, document, reference, until_ns).trace(most_items)
+    return _Tracer(recorded, document, reference).trace()
 
 
 class _Tracer:
-    def __init__(
-        self, record: RunRecord, document: RunDocument, reference: Reference | None, until_ns: int | None
-    ) -> None:
-        self._document, self._reference = document, reference
-        steps = record.columns(PLANT_STEP, "t_ns", "x", "u")
-        tests = record.columns(SENSOR_MEASUREMENT, "t_ns", "x", "x_s", "event")
-        if until_ns is not None:
-            steps = steps[steps["t_ns"] <= until_ns]
-        self._t_ns = steps["t_ns"]
-        at = np.searchsorted(self._t_ns, tests["t_ns"])
-        inside = at < len(self._t_ns)
-        tests, at = tests[inside], at[inside]
-        if len(self._t_ns) < 2 or not (self._t_ns[at] == tests["t_ns"]).all():
-            raise CallerError("a measurement is not one of a step of the plant")
-        is_test = self._is_compared(at, tests["event"] != NO_SEQUENCE)
-        tests, at = tests[is_test], at[is_test]
+    def __init__(self, recorded: RecordedLoop, document: RunDocument, reference: Reference | None) -> None:
+        self._recorded, self._document, self._reference = recorded, document, reference
+        self._t_ns, count = recorded.t_ns, len(recorded.t_ns)
         self._n = document.H.shape[0]
-        self._x = self._about(steps["x"], self._t_ns)
         self._period_ns = int(self._t_ns[1] - self._t_ns[0])
         self._propagate = Propagator(document.H)
-        self._test_steps, self._measured = at, self._about(tests["x"], tests["t_ns"])
-        self._is_test = np.zeros(len(self._t_ns), dtype=bool)
-        self._is_test[at] = True
-        is_event = tests["event"] != NO_SEQUENCE
-        self._is_event = np.zeros(len(self._t_ns), dtype=bool)
-        self._is_event[at[is_event]] = True
-        self._sent_step, self._sent_x = at[is_event], self._measured[is_event]
-        self._begin_with(knows_start=record.scenario.network.initial_sync == "known_state")
-        inputs = plant_inputs(record)
-        virtual = len(self._sent_step) - int(is_event.sum())
-        numbers = {int(sequence): i for i, sequence in enumerate(tests["event"][is_event], virtual)}
-        self._acts = self._acting_steps(record, inputs, numbers)
+        self._x = self._about(recorded.x, self._t_ns[recorded.sampled])
+        is_event = recorded.events != NO_SEQUENCE
+        is_test = self._is_compared(recorded.test_steps, is_event)
+        self._test_steps, event_steps = recorded.test_steps[is_test], recorded.test_steps[is_event]
+        self._is_test, self._is_event = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+        self._is_test[self._test_steps] = True
+        self._is_event[event_steps] = True
+        sent = recorded.measured[recorded.measured["event"] != NO_SEQUENCE]
+        self._sent_step, self._sent_x = event_steps, self._about(sent["x"], sent["t_ns"])
+        self._begin_with(knows_start=recorded.knows_start)
+        virtual = len(self._sent_step) - len(sent)
+        self._acts = self._acting_steps(
+            {int(sequence): i for i, sequence in enumerate(sent["event"], virtual)}
+        )
         self._order = sorted(self._acts.values())
         waited_ns = self._t_ns[-1] - self._t_ns[self._sent_step]
         last = self._order[-1] if self._order else _NONE
         # What was sent last may be on its way when the record ends.
         in_flight = np.flatnonzero(waited_ns <= document.delay_ns)
         self._order += in_flight[in_flight > last].tolist()
-        self._u = self._feedback(steps["u"], inputs)
-        self._ages_s = (self._t_ns - inputs.input_ns[: len(self._t_ns)]) / NS_PER_S
-        self._readings = {
-            "x": self._x,
-            "x_s": self._rows_at(at, self._about(tests["x_s"], tests["t_ns"])),
-            "x_c": self._controller_states(record, inputs),
-        }
 
     def _is_compared(self, at: Numbers, is_event: Flags) -> Flags:
         """Return which measurements the rule tests: some rules do not test each of them."""
@@ -170,11 +141,17 @@ class _Tracer:
         """Return states about the reference, (k, n)."""
         return x if self._reference is None else x - self._reference.states(t_ns)[:, : self._n]
 
-    def _rows_at(self, at: Numbers, rows: Vector) -> Vector:
-        """Return rows at their steps, NaN at others."""
-        found = np.full((len(self._t_ns), rows.shape[1]), np.nan)
-        found[at] = rows
+    def _sensor_states(self, steps: Indices) -> Vector:
+        """Return x_s at steps, (k, n), NaN where nothing is tested."""
+        found, is_test = np.full((len(steps), self._n), np.nan), self._is_test[steps]
+        rows = self._measured_at(steps[is_test])
+        found[is_test] = self._about(rows["x_s"], rows["t_ns"])
         return found
+
+    def _measured_at(self, steps: Indices) -> Rows:
+        """Return the measurements at steps that are tested."""
+        measured = self._recorded.measured
+        return measured[np.searchsorted(measured["t_ns"], self._t_ns[steps])]
 
     def _begin_with(self, *, knows_start: bool) -> None:
         """Require that the run begins with an event; a known start is as if x(0) had been sent."""
@@ -190,13 +167,11 @@ class _Tracer:
             )
         self._is_event[0] = False  # it is the start
 
-    def _acting_steps(
-        self, record: RunRecord, inputs: PlantInputs, numbers: Mapping[int, int]
-    ) -> dict[int, int]:
+    def _acting_steps(self, numbers: Mapping[int, int]) -> dict[int, int]:
         """Return by step the event whose update acts from it on, of several the newest one."""
         found: dict[int, int] = {}
-        end_ns = int(self._t_ns[-1])
-        if record.scenario.network.initial_sync == "known_state" and inputs.start_s * NS_PER_S <= end_ns:
+        inputs, end_ns = self._recorded.inputs, int(self._t_ns[-1])
+        if self._recorded.knows_start and inputs.start_s * NS_PER_S <= end_ns:
             found[int(np.searchsorted(self._t_ns, round(inputs.start_s * NS_PER_S)))] = 0
         for update in inputs.updates:
             at_ns = update.applied_ns
@@ -209,24 +184,24 @@ class _Tracer:
                 newest = kept[step] = event
         return kept
 
-    def _feedback(self, u: Vector, inputs: PlantInputs) -> Vector:
-        """Return the inputs, (steps, m): of a controller with a state, without those of the reference."""
+    def _feedback(self) -> Vector:
+        """Return the sampled inputs, (k, m): of a controller with a state, without those of the reference."""
+        u, inputs, steps = self._recorded.u, self._recorded.inputs, self._recorded.sampled
         if self._reference is None:
             return u
-        count = len(self._t_ns)
-        of_reference = self._reference.rows(inputs.input_ns[:count])[:, self._n :]
-        return np.where(inputs.is_controlled[:count, None], u - of_reference, u)
+        of_reference = self._reference.rows(inputs.input_ns[steps])[:, self._n :]
+        return np.where(inputs.is_controlled[steps, None], u - of_reference, u)
 
-    def _controller_states(self, record: RunRecord, inputs: PlantInputs) -> Vector:
-        """Return the x_c from which each step's input was computed, as at the step, (steps, n)."""
-        count, ticks = len(self._t_ns), record.columns(CONTROLLER_STEP, "sequence", "model_t_ns", "x_c")
-        found = np.full((count, self._n), np.nan)
-        at = np.searchsorted(ticks["sequence"], inputs.actuation[:count])
-        known = inputs.is_controlled[:count] & (at < len(ticks["sequence"]))
-        known[known] = ticks["sequence"][at[known]] == inputs.actuation[:count][known]
-        at = at[known]
-        x_c = self._about(ticks["x_c"][at], ticks["model_t_ns"][at])
-        ages_ns = self._t_ns[known] - ticks["model_t_ns"][at]
+    def _controller_states(self) -> Vector:
+        """Return the x_c from which the sampled inputs were computed, as at their steps, (k, n)."""
+        inputs, ticks, steps = self._recorded.inputs, self._recorded.ticks, self._recorded.sampled
+        found, actuation = np.full((len(steps), self._n), np.nan), inputs.actuation[steps]
+        at = np.searchsorted(ticks["sequence"], actuation)
+        known = inputs.is_controlled[steps] & (at < len(ticks))
+        known[known] = ticks["sequence"][at[known]] == actuation[known]
+        rows = ticks[at[known]]
+        x_c = self._about(rows["x_c"], rows["model_t_ns"])
+        ages_ns = self._t_ns[steps[known]] - rows["model_t_ns"]
         ahead = ages_ns < 0
         moved = self._propagate.advance_by(x_c, np.maximum(ages_ns, 0), self._period_ns)
         if ahead.any():
@@ -237,34 +212,41 @@ class _Tracer:
 
     # The path.
 
-    def trace(self, most_items: int) -> Trace:
+    def trace(self) -> Trace:
         """Return the path and its states."""
         walk = _RecordWalk(self._document, self._acts, self._order, self._is_event, self._is_test)
         changes = [*walk.changes()]
         last_step = len(self._t_ns) - 1 if walk.missing is None else changes[-1].key // _STAGES
         keys = self._keys(changes, walk.is_shown, last_step)
-        at = np.searchsorted([change.key for change in changes], keys, "right") - 1
+        changed = np.array([change.key for change in changes])
+        at = np.searchsorted(changed, keys, "right").astype(np.int32) - 1
         names: dict[str, int] = {}
-        locations = np.array([names.setdefault(change.location, len(names)) for change in changes])
-        edges = np.array([names.setdefault(change.edge, len(names)) for change in changes])
-        is_motion = keys[1:] % _STAGES == _MOVED
+        locations = np.array([names.setdefault(change.location, len(names)) for change in changes], np.int32)
+        edges = np.array([names.setdefault(change.edge, len(names)) for change in changes], np.int32)
+        steps, stages = np.divmod(keys, np.int32(_STAGES))
+        is_motion = stages[1:] == _MOVED
         items = np.where(is_motion, locations[at[:-1]], edges[at[1:]])
-        silent = ~is_motion & (np.array([change.key for change in changes])[at[1:]] != keys[1:])
+        silent = ~is_motion & (changed[at[1:]] != keys[1:])
         for index in np.unique(at[1:][silent]).tolist():  # silent tests that lead to where the loop is
             edge = self._silent_edge(changes[index].location)
             items[silent & (at[1:] == index)] = names.setdefault(edge, len(names))
         unknown = {} if walk.missing is None else {changes[-1].edge: self._unknown(walk.missing)}
-        numbers = np.array([change[2:5] for change in changes], np.int64)[at]
-        steps = keys // _STAGES
-        is_lost = np.array([not self._is_waiting(change) for change in changes])[at]
-        is_sampled = _sample(len(items), most_items)
-        known = np.append(is_sampled, False) | np.append(False, is_sampled)
-        z = self._z(steps[known], numbers[known], is_lost[known])
-        self._add_noise(z, steps[known], np.append(is_motion, True)[known])
+        is_known = self._recorded.is_sampled[steps]
+        known, by_change = steps[is_known], at[is_known]
+        numbers = np.array([change[2:5] for change in changes], np.int64)[by_change]
+        is_lost = np.array([not self._is_waiting(change) for change in changes])[by_change]
+        samples = np.searchsorted(self._recorded.sampled, known)
+        x = self._x[samples]
+        z = self._z(x, known, numbers, is_lost)
+        self._add_noise(z, x, known, np.append(is_motion, True)[is_known])
+        x_c = self._controller_states()[samples]
         return Trace(
-            [*names], items, is_motion, steps, self._clocks(keys, changes, at), is_sampled,
-            np.where(known, np.cumsum(known) - 1, -1), z, self._t_ns, self._u, self._readings, unknown,
-            self._ages_s,
+            names=[*names], items=items, is_motion=is_motion, steps=steps,
+            clocks_ns=self._clocks(steps, stages == _TESTED, changes, at),
+            is_sampled=is_known[:-1] & is_known[1:],
+            rows=np.where(is_known, np.cumsum(is_known, dtype=np.int32) - 1, np.int32(-1)),
+            z=z, t_ns=self._t_ns, is_recorded=self._recorded.is_recorded, u=self._feedback()[samples],
+            readings={"x": x, "x_s": self._sensor_states(known), "x_c": x_c}, unknown=unknown,
         )  # fmt: skip
 
     def _unknown(self, missing: Transition) -> Unknown:
@@ -272,7 +254,7 @@ class _Tracer:
         alike = [each.number for each in places if each[:2] == wanted[:2]]
         return Unknown(missing, max(alike, default=-1))
 
-    def _keys(self, changes: list[_LocationChange], is_shown: Mapping[str, bool], last_step: int) -> Numbers:
+    def _keys(self, changes: list[_LocationChange], is_shown: Mapping[str, bool], last_step: int) -> Indices:
         """Return the keys of all states: after each motion, arrival, and test that the document shows."""
         changed = np.array([change.key for change in changes], np.int64)
         at = np.searchsorted(changed, self._test_steps * _STAGES + _TESTED, "left") - 1
@@ -282,7 +264,7 @@ class _Tracer:
         is_key[_MOVED::_STAGES] = True
         is_key[changed] = True
         is_key[tests * _STAGES + _TESTED] = True
-        keys = np.flatnonzero(is_key)
+        keys = np.flatnonzero(is_key).astype(np.int32)
         return keys[keys <= changed[-1]] if last_step < len(self._t_ns) - 1 else keys
 
     def _silent_edge(self, location: str) -> str:
@@ -292,25 +274,25 @@ class _Tracer:
     def _is_waiting(self, change: _LocationChange) -> bool:
         return change.following >= 0 or change.acting < 0
 
-    def _clocks(self, keys: Numbers, changes: list[_LocationChange], at: Numbers) -> Numbers:
+    def _clocks(
+        self, steps: Indices, is_tested: Flags, changes: list[_LocationChange], at: Indices
+    ) -> Numbers:
         """Return the clock of each state, (k + 1,)."""
-        document, steps = self._document, keys // _STAGES
-        t_ns, is_tested = self._t_ns[steps], keys % _STAGES == _TESTED
+        document, now_ns = self._document, self._t_ns[steps]
         if document.is_periodic:
-            events = np.array([change.events for change in changes])[at]
-            return np.asarray(t_ns - self._t_ns[self._sent_step[events - 1]])
-        tests = self._test_steps
-        if not len(tests) or tests[0] > 0:
-            tests = np.append(0, tests)
-        before = np.searchsorted(tests, np.where(is_tested, steps + 1, steps), "left") - 1
-        since_test = t_ns - self._t_ns[tests[np.maximum(before, 0)]]
-        if document.is_by_tests:
-            return np.asarray(since_test)
-        following = np.array([change.following for change in changes])[at]
-        starts = np.array([self._starts(change.location) for change in changes])[at]
-        since_sent = t_ns - self._t_ns[self._sent_step[np.maximum(following, 0)]]
-        waiting = np.where(following >= 0, since_sent, since_test)
-        return np.asarray(np.where(starts, t_ns - self._t_ns[0], waiting))
+            events = np.array([change.events for change in changes])
+            return np.asarray(now_ns - self._t_ns[self._sent_step[events - 1]][at])
+        start_ns = self._t_ns[0]
+        tested_ns = np.maximum.accumulate(np.where(self._is_test, self._t_ns, start_ns))
+        before_ns = np.append(start_ns, tested_ns[:-1])
+        clocks = np.where(is_tested, tested_ns[steps], before_ns[steps])
+        if not document.is_by_tests:
+            following = np.array([change.following for change in changes])
+            is_sent, starts = following >= 0, np.array([self._starts(each.location) for each in changes])
+            sent_ns = self._t_ns[self._sent_step[np.maximum(following, 0)]]
+            since_ns = np.where(starts, start_ns, sent_ns)
+            clocks = np.where((is_sent | starts)[at], since_ns[at], clocks)
+        return np.asarray(now_ns - clocks)
 
     def _starts(self, location: str) -> bool:
         place = self._document.places.get(location)
@@ -318,19 +300,19 @@ class _Tracer:
 
     # States.
 
-    def _flow(self, events: Numbers, steps: Numbers) -> Vector:
+    def _flow(self, events: Numbers, steps: Indices) -> Vector:
         """Return the states that events sent, as the models move them up to steps, (k, n)."""
         ages_ns = self._t_ns[steps] - self._t_ns[self._sent_step[events]]
         return self._propagate.advance_by(self._sent_x[events], ages_ns, self._period_ns)
 
-    def _z(self, steps: Numbers, numbers: Numbers, is_lost: Flags) -> Vector:
-        """Return z of each state, (k + 1, coordinates); ``numbers`` are those of :class:`_LocationChange`."""
+    def _z(self, x: Vector, steps: Indices, numbers: Numbers, is_lost: Flags) -> Vector:
+        """Return z of states, (k, coordinates); ``numbers`` are those of :class:`_LocationChange`."""
         document, (events, acting, following) = self._document, numbers.T
         newest = self._flow(events - 1, steps)
         acts = acting >= 0
         driving = newest.copy()
         driving[acts] = self._flow(acting[acts], steps[acts])
-        x, reduce = self._x[steps], document.seen.T
+        reduce = document.seen.T
         z = x @ document.states
         smooth, decaying = self._smooth(steps)
         if smooth.shape[1]:
@@ -355,16 +337,16 @@ class _Tracer:
             if unit in names:
                 yield names.index(unit), rate
 
-    def _smooth(self, steps: Numbers) -> tuple[Vector, Vector]:
+    def _smooth(self, steps: Indices) -> tuple[Vector, Vector]:
         """Return s, the decaying error of an observer's estimate, and its part of the estimate."""
         columns, rates, start = self._document.smooth
         if not len(rates):
             return np.zeros((len(steps), 0)), np.zeros((len(steps), self._n))
-        first = np.tile(start[:, 0], (len(self._t_ns), 1))
-        s = Propagator(rates).advance_by(first, self._t_ns, self._period_ns)[steps]
+        first = np.tile(start[:, 0], (len(steps), 1))
+        s = Propagator(rates).advance_by(first, self._t_ns[steps], self._period_ns)
         return s, s @ columns.T
 
-    def _add_noise(self, z: Vector, steps: Numbers, is_before_motion: Flags) -> None:
+    def _add_noise(self, z: Vector, x: Vector, steps: Indices, is_before_motion: Flags) -> None:
         """Set the noise of each state that a test reads: what was measured, minus x and what decays."""
         document = self._document
         if not document.noise:
@@ -373,11 +355,11 @@ class _Tracer:
         reads[0] = True  # the start is an event
         at = np.flatnonzero(reads & self._is_test[steps])
         here = steps[at]
-        measured = self._measured[np.searchsorted(self._test_steps, here)]
+        tests = self._measured_at(here)
         limits = np.ones((len(at), len(document.noise)))
         decay = np.exp(-document.rate_per_s * self._t_ns[here] / NS_PER_S)
         limits[:, : document.decaying_noise] = decay[:, None]
-        noise = measured - self._x[here] - self._smooth(here)[1]
+        noise = self._about(tests["x"], tests["t_ns"]) - x[at] - self._smooth(here)[1]
         z[np.ix_(at, np.array(document.noise))] = _within(document.noise_columns, noise, limits)
 
 
@@ -492,16 +474,6 @@ class _RecordWalk:
         else:
             place = Place(False, False, event - now.acting)
         return self._taken(now, step * _STAGES + _TESTED, EdgeKind.EVENT, place)
-
-
-def _sample(items: int, most: int) -> Flags:
-    """Return which items are compared in all numbers, (items,): at most about ``most``, evenly spread."""
-    if items <= most:
-        return np.ones(items, dtype=bool)
-    starts = np.linspace(0, items - _WINDOW, max(most // _WINDOW, 1)).astype(np.int64)
-    found = np.zeros(items, dtype=bool)
-    found[(starts[:, None] + np.arange(_WINDOW)).ravel()] = True
-    return found
 
 
 def _within(columns: Vector, noise: Vector, limits: Vector) -> Vector:

@@ -11,6 +11,8 @@ import pytest
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.run_certificates import certificates_under
 from cosim.analysis.conformance.conformance import compare
+from cosim.analysis.conformance.document_numbers import DocumentNumbers
+from cosim.analysis.conformance.recorded_loop import RecordedLoop
 from cosim.analysis.conformance.run_conformance import conformance, conformance_with, reference_of_bounds
 from cosim.analysis.conformance.run_document import RunDocument, document_of_statement
 from cosim.analysis.conformance.trace import Trace, trace_of
@@ -44,11 +46,11 @@ def traced(request: pytest.FixtureRequest) -> tuple[Trace, Table]:
     """Return the trace of a simulated run with all losses that are allowed, and its document."""
     record = simulate(resolved(request.param, f"horizon_s={HORIZON_S}"))
     document = document_of_scenario(request.param)
-    return trace_of(record, document), document.table
+    return trace_of(RecordedLoop(record), document), document.table
 
 
 def test_a_run_is_a_run_of_its_document(traced: tuple[Trace, Table]) -> None:
-    found = compare(*traced)
+    found = compare(traced[0], DocumentNumbers(traced[1]))
     assert found.conforms, found.failure
     assert sum(count > 0 for count in found.edges.values()) >= len(found.edges) - 2
     assert max(found.clocks.values()) == pytest.approx(1.0)
@@ -167,7 +169,7 @@ REFUTED: dict[Change, set[Failed]] = {
 def test_a_document_with_a_fault_is_refuted(traced: tuple[Trace, Table], change: Change) -> None:
     trace, document = traced[0], copy.deepcopy(traced[1])
     change(document)
-    found = compare(trace, document)
+    found = compare(trace, DocumentNumbers(document))
     assert not found.conforms
     assert found.until_s < HORIZON_S
     assert found.failure is not None
@@ -197,21 +199,23 @@ def change_a_state(trace: Trace) -> None:
 
 
 def change_an_input(trace: Trace) -> None:
-    trace.u[200] *= 1.01
+    trace.u[np.flatnonzero(trace.is_motion)[200]] *= 1.01
 
 
 def leave_out_the_states(trace: Trace) -> None:
     """The record seems to have no state at a step."""
-    trace.readings["x"][300] = np.nan
+    trace.is_recorded[300] = False
 
 
 def change_the_sensors_model(trace: Trace) -> None:
-    at = np.flatnonzero(np.isfinite(trace.readings["x_s"][:, 0]))
+    after = np.flatnonzero(trace.is_motion) + 1
+    at = after[np.isfinite(trace.readings["x_s"][after, 0])]
     trace.readings["x_s"][at[len(at) // 2]] *= 1.001
 
 
 def change_the_controllers_model(trace: Trace) -> None:
-    at = np.flatnonzero(np.isfinite(trace.readings["x_c"][:, 0]))
+    before = np.flatnonzero(trace.is_motion)
+    at = before[np.isfinite(trace.readings["x_c"][before, 0])]
     trace.readings["x_c"][at[len(at) // 2]] *= 1.001
 
 
@@ -231,7 +235,7 @@ WRONG: dict[Callable[[Trace], None], set[Failed]] = {
 def test_a_wrong_trace_is_refuted(traced: tuple[Trace, Table], change: Callable[[Trace], None]) -> None:
     trace = copy.deepcopy(traced[0])
     change(trace)
-    found = compare(trace, traced[1])
+    found = compare(trace, DocumentNumbers(traced[1]))
     assert found.failure is not None
     assert found.failure.kind in WRONG[change], found.failure
 
@@ -248,13 +252,13 @@ def other(request: pytest.FixtureRequest) -> tuple[Trace, RunDocument, Matrix]:
     document, loop = document_of_statement(statement, Naming(request.param)), statement.loop
     assert loop is not None
     record = simulate(scenario)
-    trace = trace_of(record, document, reference_of_bounds(scenario))
-    assert compare(trace, document.table).conforms
+    trace = trace_of(RecordedLoop(record), document, reference_of_bounds(scenario))
+    assert compare(trace, document.numbers).conforms
     return trace, document, floats(loop.B)
 
 
 def refuted(trace: Trace, table: Table) -> bool:
-    return not compare(trace, table).conforms
+    return not compare(trace, DocumentNumbers(table)).conforms
 
 
 def test_another_plant_is_refuted(other: tuple[Trace, RunDocument, Matrix]) -> None:
@@ -280,7 +284,7 @@ def test_one_loss_fewer_is_refuted_where_so_many_occur(other: tuple[Trace, RunDo
 
 def test_each_edge_that_was_taken_is_needed(other: tuple[Trace, RunDocument, Matrix]) -> None:
     trace, document, _ = other
-    taken = [name for name, count in compare(trace, document.table).edges.items() if count]
+    taken = [name for name, count in compare(trace, document.numbers).edges.items() if count]
     assert len(taken) >= 3
     for name in taken:
         table = dict(document.table)

@@ -1,0 +1,142 @@
+"""A loop document as floating-point numbers: what a comparison needs of it, computed once for all runs.
+
+It is as trusted as ``conformance.py``, which reads it. Of an interval it has the middle.
+"""
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+from noack.core.cached_method import cached_method
+from noack.core.linear_systems import Matrix
+
+Table = Mapping[str, Any]
+TINY = 1e-12
+_PARTS = 8
+
+
+class Split(NamedTuple):
+    """A motion ż = F z + B u + Σ c p with u in the hull of Uᵢ z."""
+
+    F: Matrix
+    B: Matrix
+    U: Sequence[Matrix]
+    columns: Matrix
+    rows: Sequence[Matrix]
+
+
+class Flow(NamedTuple):
+    """What a motion does in a time T: z(T) = ``state`` z + ``input`` u + Σ ``signals`` p of constant u and p."""
+
+    state: Matrix
+    input: Matrix
+    signals: Matrix
+    varied: Matrix
+    """By how much a varying signal of size 1 may move z otherwise than a constant one, (n, signals)."""
+
+
+class DocumentNumbers:
+    """A loop document, and its matrices as numbers.
+
+    Args:
+        table: the document, which must not change.
+    """
+
+    def __init__(self, table: Table) -> None:
+        self.table = table
+        self.names = [coordinate["name"] for coordinate in table["coordinates"]]
+        self.noise = [i for i, c in enumerate(table["coordinates"]) if c.get("noise")]
+        self.states = [i for i in range(len(self.names)) if i not in self.noise]
+        self.locations = {location["name"]: location for location in table["locations"]}
+        self.edges = {edge["name"]: edge for edge in table["edges"]}
+        self.place_numbers = {name: number for number, name in enumerate(self.locations)}
+        decaying = table.get("decaying")
+        self.units = [decaying["coordinate"] if decaying else "", table.get("constant") or ""]
+
+    @cached_method
+    def rows(self, name: str) -> Matrix:
+        """Return the rows of a name."""
+        return _matrix(self.table["rows"][name])
+
+    @cached_method
+    def jump(self, edge: str) -> Matrix:
+        """Return J of an edge."""
+        return _matrix(self.edges[edge]["jump"])
+
+    @cached_method
+    def start(self) -> Matrix:
+        """Return z(0), and what each noise coordinate adds to it."""
+        return _matrix(self.table["start"]["columns"])
+
+    @cached_method
+    def readings(self) -> Mapping[str, Sequence[tuple[Matrix, Sequence[str]]]]:
+        """Return of each reading its rows, and the locations in which these count."""
+        return {
+            name: [(_matrix(part["rows"]), part["in"]) for part in parts]
+            for name, parts in self.table["readings"].items()
+        }
+
+    @cached_method
+    def outside(self, location: str) -> Sequence[int]:
+        """Return the states that a location lacks, but for the units."""
+        has = (*self.locations[location]["coordinates"], *self.units)
+        return [i for i in self.states if self.names[i] not in has]
+
+    @cached_method
+    def split(self, motion: str) -> Split | None:
+        """Return the parts of a motion; None: its corners have no common part."""
+        corners = self.table["motions"][motion]
+        F = [_matrix(corner["matrix"]) for corner in corners]
+        U = [_matrix(corner["input"]) for corner in corners]
+        unknown = corners[0]["unknown"]
+        columns = np.hstack([_matrix(each["column"]) for each in unknown] or [np.zeros((len(F[0]), 0))])
+        rows = [_matrix(each["rows"]) for each in unknown]
+        if len(corners) == 1:  # then u is U z, and F has its part
+            return Split(F[0], np.zeros((len(F[0]), len(U[0]))), U, columns, rows)
+        mean_F, mean_U = sum(F) / len(F), sum(U) / len(U)
+        differences = np.hstack([each - mean_U for each in U]), np.hstack([each - mean_F for each in F])
+        B = differences[1] @ np.linalg.pinv(differences[0])
+        if np.abs(B @ differences[0] - differences[1]).max(initial=0) > 1e-6 * (np.abs(mean_F).max() + TINY):
+            return None
+        return Split(np.asarray(mean_F - B @ mean_U), B, U, columns, rows)
+
+    @cached_method
+    def flow(self, motion: str, length_s: float) -> Flow:
+        """Return what a motion that has a split does in a time."""
+        split = self.split(motion)
+        assert split is not None
+        n, m, k = len(split.F), split.B.shape[1], split.columns.shape[1]
+        whole = np.zeros((n + m + k, n + m + k))
+        whole[:n, :n], whole[:n, n : n + m], whole[:n, n + m :] = split.F, split.B, split.columns
+        moved = expm(whole * length_s)[:n]
+        return Flow(moved[:, :n], moved[:, n : n + m], moved[:, n + m :], _variation(split, length_s))
+
+
+def _variation(split: Split, length_s: float) -> Matrix:
+    """Return :attr:`Flow.varied`.
+
+    Its effect is ∫ g p ds with g = e^{F(T − s)} c, so this is ∫ |g − mean of g| ds.
+    """
+    parts = np.linspace(0.0, length_s, 2 * _PARTS + 1)[1::2]
+    effects = np.stack([expm(split.F * s) @ split.columns for s in parts])
+    return np.asarray(length_s * np.abs(effects - effects.mean(axis=0)).mean(axis=0))
+
+
+def value(entry: Any) -> float:
+    """Return an entry of a document as a number."""
+    if isinstance(entry, list):
+        return (value(entry[0]) + value(entry[1])) / 2
+    return float(Fraction(entry)) if isinstance(entry, str) else float(entry)
+
+
+def _matrix(rows: Sequence[Sequence[Any]]) -> Matrix:
+    try:
+        plain = np.array(rows, dtype=float)
+    except ValueError:  # it has quotients or intervals
+        plain = np.zeros(0)
+    if plain.ndim == 2:
+        return plain
+    return np.array([[value(entry) for entry in row] for row in rows], dtype=float)
