@@ -19,13 +19,15 @@ computed in floating point, with tolerances relative to the sizes of the terms.
 """
 
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from scipy.optimize import lsq_linear, nnls
 
 from cosim.analysis.conformance.document_numbers import TINY, DocumentNumbers, Flow, Split, Table, value
-from cosim.analysis.conformance.trace import Flags, Numbers, Trace
+from cosim.analysis.conformance.recorded_loop import Flags, Numbers
+from cosim.analysis.conformance.trace import Trace
 from cosim.analysis.conformance.verdicts import Conformance, Failed, Failure
 from netem.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
@@ -75,7 +77,7 @@ class _Checked:
         kinds = 2 * trace.items + trace.is_motion
         order = np.argsort(kinds, kind="stable")
         ends = np.searchsorted(kinds[order], np.arange(2 * len(trace.names) + 1))
-        self._at = [order[first:last] for first, last in zip(ends[:-1], ends[1:], strict=True)]
+        self._at = [order[first:last] for first, last in pairwise(ends.tolist())]
 
     # The path.
 

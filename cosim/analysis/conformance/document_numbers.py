@@ -29,7 +29,7 @@ class Split(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """What a motion does in a time T: z(T) = ``state`` z + ``input`` u + Σ ``signals`` p of constant u and p."""
+    """What a motion does in a time: ``state`` z + ``input`` u + ``signals`` p, of constant u and p."""
 
     state: Matrix
     input: Matrix

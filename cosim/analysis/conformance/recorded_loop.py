@@ -1,7 +1,7 @@
 """What is read of a loop's record for its trace, whatever its document is.
 
-Times, events and the origins of inputs are read of all steps. States and inputs are read of a sample of a long
-run, so that the end of a run costs about the same however long it was.
+Times, events and the origins of inputs are read of all steps. States and inputs are read of a sample of a
+long run, so that they need little memory.
 """
 
 import math
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.conformance.input_origins import PlantInputs, plant_inputs
-from cosim.record.rows import concatenate_rows, pack_rows, with_columns
+from cosim.record.rows import Rows, concatenate_rows, pack_rows, with_columns
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -95,13 +95,12 @@ class RecordedLoop:
 
     def _read_ticks(self, record: RunRecord) -> None:
         wanted = np.unique(self.inputs.actuation[self.sampled])
-        self.ticks = record.columns(
-            CONTROLLER_STEP,
-            "sequence",
-            "model_t_ns",
-            "x_c",
-            where=lambda rows: np.isin(rows["sequence"], wanted),
-        )
+
+        def is_wanted(rows: Rows) -> Flags:
+            at = np.searchsorted(wanted, rows["sequence"])
+            return np.asarray(wanted[np.minimum(at, len(wanted) - 1)] == rows["sequence"])
+
+        self.ticks = record.columns(CONTROLLER_STEP, "sequence", "model_t_ns", "x_c", where=is_wanted)
         """``sequence``, ``model_t_ns`` and ``x_c`` of the inputs of steps that are sampled."""
 
 

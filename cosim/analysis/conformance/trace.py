@@ -227,9 +227,10 @@ class _Tracer:
         is_motion = stages[1:] == _MOVED
         items = np.where(is_motion, locations[at[:-1]], edges[at[1:]])
         silent = ~is_motion & (changed[at[1:]] != keys[1:])
-        for index in np.unique(at[1:][silent]).tolist():  # silent tests that lead to where the loop is
-            edge = self._silent_edge(changes[index].location)
-            items[silent & (at[1:] == index)] = names.setdefault(edge, len(names))
+        stays = at[1:][silent]  # silent tests that lead to where the loop is
+        for index in np.unique(stays).tolist():
+            edges[index] = names.setdefault(self._silent_edge(changes[index].location), len(names))
+        items[silent] = edges[stays]
         unknown = {} if walk.missing is None else {changes[-1].edge: self._unknown(walk.missing)}
         is_known = self._recorded.is_sampled[steps]
         known, by_change = steps[is_known], at[is_known]
