@@ -108,7 +108,7 @@ class Run:
 
     @property
     def claims(self) -> list[Claim]:
-        """The claims about all loops, each with its ``verdict``: held, violated or void."""
+        """The claims about all loops, each with its ``verdict``, as ``ClaimVerdict`` lists them."""
         return [claim for loop in self.summary.loops for claim in loop.claims]
 
     @property

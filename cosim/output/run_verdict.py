@@ -12,6 +12,7 @@ from cosim.analysis.conformance.verdicts import Failed
 from cosim.analysis.summary.summary_model import (
     Claim,
     ClaimCause,
+    ClaimKind,
     ClaimVerdict,
     ExitPart,
     IdealLoopPart,
@@ -25,7 +26,7 @@ from cosim.output.result_tables import Tone
 from cosim.output.run_tables import changes_in, shares_network, state_norm
 from cosim.simulation.continuous import ContinuousSummary
 from netem.core.errors import ExitStatus
-from netem.core.number_format import counted, duration_at_least, number
+from netem.core.number_format import at_most, counted, duration_at_least, number, percent
 from noack.protocol.wire_format import Rejection
 from noack.runtime.counting_sockets import DROPPED_IN_FLOOD
 from noack.runtime.end_reasons import HORIZON
@@ -95,7 +96,7 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
     """Return what became of the outputs, and what was guaranteed of them, in one sentence."""
     claims = [claim for claim in loop.claims if claim.until_s is None]  # they hold to the end of the run
     held = [claim for claim in claims if claim.output and claim.verdict == "held"]
-    guaranteed = {claim.output: claim.what for claim in held if " stays within " in claim.what}
+    settles_s = {claim.output: claim.settles_s for claim in held if claim.settles_s is not None}
     bounded = {claim.output for claim in held}
     has_target = all(output.target is not None for output in loop.outputs)
     is_good = not _grew(loop) if has_target else loop.diverged_at_s is None
@@ -109,11 +110,10 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
         else:
             since = f"from {output.settled_s:.3g} s on"
             texts.append(f"{output.name} was within {allowed} of its {output.target} {since}")
-        what = guaranteed.get(output.name, "")
-        promised = what.rpartition(" from ")[2] if f" of its {output.target} " in what else ""
+        promised = "" if output.target is None else _promise(settles_s.get(output.name))
         by = " by the end of the run" if output.name in bounded else ""  # later, or not at all
         lacking = "not guaranteed for delays as in this run" if is_late else f"not guaranteed{by}"
-        texts[-1] += f" (guaranteed from {promised})" if promised else f" ({lacking})"
+        texts[-1] += f" (guaranteed {promised})" if promised else f" ({lacking})"
         is_good = is_good and output.settled_s is not None
     together = " and "
     if not texts:
@@ -131,6 +131,13 @@ def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
     if not has_target:
         text += "; their set-point is not known, as a class computes the input: controller.setpoint states it"
     return _line(text, Tone.GOOD if is_good else Tone.DOUBTFUL)
+
+
+def _promise(settles_s: float | None) -> str:
+    """Return from when on an output is within its allowed error; empty if this is not guaranteed."""
+    if settles_s is None:
+        return ""
+    return f"from {at_most(settles_s, 3)} s on" if settles_s else "at all times"
 
 
 def _grew(loop: LoopSummary) -> bool:
@@ -258,7 +265,13 @@ def guarantee_of(loop: LoopSummary) -> GuaranteeVerdict:
 def _if_broken(loop: LoopSummary) -> GuaranteeVerdict | None:
     """Return since when and why the guarantee is broken; None if it is not."""
     broken = [(part.t_s, part.what) for part in loop.violations]
-    violated = [claim for claim in loop.claims if claim.verdict is ClaimVerdict.VIOLATED]
+    # Of the guarantee the processes reported more, where they saw it broken.
+    violated = [
+        claim
+        for claim in loop.claims
+        if claim.verdict is ClaimVerdict.VIOLATED
+        and not (claim.kind is ClaimKind.GUARANTEE and loop.violations)
+    ]
     if violated:
         named = list(dict.fromkeys(claim.what for claim in violated))
         more = [f"{len(named) - _MOST_NAMED} more"] if len(named) > _MOST_NAMED else []
@@ -276,7 +289,8 @@ def _if_kept(loop: LoopSummary) -> GuaranteeVerdict | None:
     certified = [claim for claim in loop.claims if claim.is_certified]
     if not certified:
         return None
-    coverage = "; ".join(filter(None, (_certified_times(loop), _end_of_certificates(loop))))
+    parts = (_certified_times(loop), _end_of_certificates(loop), _sample_of(loop))
+    coverage = "; ".join(filter(None, parts))
     if not (ended := _ended_claims(loop)):
         return GuaranteeVerdict(Tone.GOOD, 0.0, coverage)
     if not any(claim.verdict is ClaimVerdict.HELD for claim in certified):
@@ -367,6 +381,12 @@ def _end_of_certificates(loop: LoopSummary) -> str:
     if until_s is None:
         return ""
     return f"certificates end at the change of settings at {until_s:.3f} s, (I1) was checked to the end"
+
+
+def _sample_of(loop: LoopSummary) -> str:
+    """Return of which share of the steps the motion was compared, of a long run; else empty."""
+    share = min((part.share for part in loop.conformance if part.document), default=1.0)
+    return f"the motion was compared at {percent(share)} of the steps" if share < 1 else ""
 
 
 def _covers_lateness(loop: LoopSummary) -> bool:

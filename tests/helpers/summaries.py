@@ -36,6 +36,7 @@ def with_values(run: RunSummary, **more: Any) -> RunSummary:
 def claim(verdict: str, **more: Any) -> dict[str, Any]:
     """A claim about a loop, in the form of the summary."""
     return {
-        "what": "a", "source": "certificate", "bound": "c", "ratio": 1.0, "since_s": 1.0,
+        "what": "a", "kind": "certificate", "source": "certificate", "bound": "c", "ratio": 1.0,
+        "since_s": 1.0,
         "verdict": verdict, "certified": 1.0, "observed": 1.0, "until_s": None, **more,
     }  # fmt: skip

@@ -14,6 +14,7 @@ import numpy as np
 
 from cosim.analysis.claims.observed_conditions import Reals
 from cosim.analysis.claims.run_evidence import ROUNDING, ClaimEnd, RunEvidence, Samples, earliest
+from cosim.analysis.summary.summary_model import ClaimKind
 from netem.core.number_format import at_most
 from netem.core.row_operations import row_norms
 from noack.core.linear_systems import Propagator
@@ -28,7 +29,6 @@ _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
 _EPSILON = float(np.finfo(float).eps)
 _SMALLEST_NORMAL = float(np.finfo(float).tiny)
 """Smaller numbers have fewer digits: rounding may change them by a multiple."""
-_CERTIFICATE = "certificate"
 _COMPLETE = "a complete record"
 _CONTINUOUS = "a continuous trigger, a network without delay"
 _CAPPED = "at most M − 1 consecutive losses"
@@ -85,8 +85,12 @@ class ClaimDefinition:
 
     find: BoundFinder
     statement: str
+    kind: ClaimKind
+    """That of certificates is evaluated for each certificate of the scenario."""
     source: str
-    """``"certificate"``: it is evaluated for each certificate of the scenario."""
+    """That of a certificate is the certificate's."""
+    quantity: str | None
+    """What is bounded, as in :class:`Claim`."""
     assumes: str
     needs_ideal_loop: bool = False
     """A run that exceeds the bound does not refute it."""
@@ -94,26 +98,40 @@ class ClaimDefinition:
     """It holds across changes of settings."""
     output: str | None = None
     """The output that it is about."""
+    settles_s: float | None = None
+    """From when on the output stays within its allowed error."""
 
     @property
     def is_certified(self) -> bool:
         """Whether a certificate claims it."""
-        return self.source == _CERTIFICATE
+        return self.kind is ClaimKind.CERTIFICATE
 
 
-def claim(
-    statement: str, source: str, assumes: str, *, needs_ideal_loop: bool = False, to_the_end: bool = False
-) -> Callable[[BoundFinder], ClaimDefinition]:
-    """Make a function the definition of a claim that needs no certificate."""
+def identity(statement: str, quantity: str | None = None) -> Callable[[BoundFinder], ClaimDefinition]:
+    """Make a function the definition of a claim by the identity (I1)."""
     return lambda find: ClaimDefinition(
-        find, statement, source, assumes, needs_ideal_loop=needs_ideal_loop, to_the_end=to_the_end
+        find, statement, ClaimKind.IDENTITY, "(I1)", quantity, _COMPLETE, to_the_end=True
     )
 
 
-def certified(statement: str, output: str | None = None) -> Callable[[BoundFinder], ClaimDefinition]:
+def of_paper(
+    statement: str, source: str, assumes: str, quantity: str
+) -> Callable[[BoundFinder], ClaimDefinition]:
+    """Make a function the definition of a claim of the paper."""
+    return lambda find: ClaimDefinition(
+        find, statement, ClaimKind.PAPER, source, quantity, assumes, needs_ideal_loop=True
+    )
+
+
+def certified(
+    statement: str, quantity: str, output: str | None = None, settles_s: float | None = None
+) -> Callable[[BoundFinder], ClaimDefinition]:
     """Make a function the definition of a claim of certificates."""
     assumes = "the run conforms to the loop document of the certificate"
-    return lambda find: ClaimDefinition(find, statement, _CERTIFICATE, assumes, output=output)
+    return lambda find: ClaimDefinition(
+        find, statement, ClaimKind.CERTIFICATE, "certificate", quantity, assumes,
+        output=output, settles_s=settles_s,
+    )  # fmt: skip
 
 
 def norm_text(run: RunEvidence, vector: str) -> str:
@@ -183,12 +201,7 @@ def least_inter_event_time(
 # Identity (I1), and the paper's theorems.
 
 
-@claim(
-    "the controller's error is at most the sensor's error plus the missed jumps",
-    "(I1)",
-    _COMPLETE,
-    to_the_end=True,
-)
+@identity("the controller's error is at most the sensor's error plus the missed jumps", "e_c")
 def i1_controller_error(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """The triangle inequality for (I1)."""
     error, values = (
@@ -203,7 +216,7 @@ def i1_controller_error(run: RunEvidence, samples: Samples, _: None) -> ClaimBou
     )
 
 
-@claim("x_c − x_s is the sum of the missed jumps", "(I1)", _COMPLETE, to_the_end=True)
+@identity("x_c − x_s is the sum of the missed jumps")
 def i1_model_difference(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """(I1) itself, up to rounding."""
     here, margin = samples.is_bounded, _margin(run)
@@ -231,7 +244,7 @@ def _margin(run: RunEvidence) -> float:
     return max(_LEAST_MARGIN, min(rounding, _LARGEST_MARGIN))
 
 
-@claim("the paper's bound of the controller's error", "eq:LossEv3", _CONTINUOUS, needs_ideal_loop=True)
+@of_paper("the paper's bound of the controller's error", "eq:LossEv3", _CONTINUOUS, "e_c")
 def paper_error_bound(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """(I1) with the threshold in place of e_s at the events."""
     coverage = run.record.scenario.coverage
@@ -243,11 +256,11 @@ def paper_error_bound(run: RunEvidence, samples: Samples, _: None) -> ClaimBound
     return ClaimBound(controller_error_bound(run, samples, formula, samples.error_bounds[1]))
 
 
-@claim(
+@of_paper(
     "the controller's error decays",
     "Theorem 1 (3 for a hold), Δ from this run's trajectory",
     f"{_CONTINUOUS}, {_CAPPED}",
-    needs_ideal_loop=True,
+    "e_c",
 )
 def theorem_1_controller_error(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """Theorem 1 with the Δ of the trajectory."""
@@ -261,7 +274,7 @@ def theorem_1_controller_error(run: RunEvidence, samples: Samples, _: None) -> C
     return ClaimBound(controller_error_bound(run, samples, formula, delta * level, delta, end))
 
 
-@claim("minimum inter-event time", "Theorem 2, eq:tau", _IDEAL, needs_ideal_loop=True)
+@of_paper("minimum inter-event time", "Theorem 2, eq:tau", _IDEAL, "inter_event")
 def theorem_2_inter_event_time(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """Theorem 2's τ."""
     if run.theorem_2 is None:
@@ -277,7 +290,7 @@ def theorem_2_inter_event_time(run: RunEvidence, samples: Samples, _: None) -> C
     return least if knows_state else ClaimBound(None, least.envelope)
 
 
-@claim("the state decays", "Theorem 2, eq:normXt", _IDEAL, needs_ideal_loop=True)
+@of_paper("the state decays", "Theorem 2, eq:normXt", _IDEAL, "x")
 def theorem_2_state(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """Theorem 2's bound of ‖x‖."""
     if run.theorem_2 is None:
@@ -295,7 +308,7 @@ def theorem_2_state(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
 # What a certificate claims.
 
 
-@certified("the controller's error is bounded")
+@certified("the controller's error is bounded", "e_c")
 def controller_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖e_c‖_W from when the plant applies the controller's input on, with the x_c of this input."""
     if not certificate.has("e_c"):
@@ -310,7 +323,7 @@ def controller_error(run: RunEvidence, samples: Samples, certificate: ScenarioCe
     )
 
 
-@certified("the estimation error is bounded")
+@certified("the estimation error is bounded", "estimate")
 def estimation_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖x̂ − x‖_W at the measurements."""
     loop = run.record.loop
@@ -325,7 +338,7 @@ def estimation_error(run: RunEvidence, samples: Samples, certificate: ScenarioCe
     return ClaimBound(Bound(formula, t_s, shares, None, certificate.first("estimate")))
 
 
-@certified("minimum inter-event time")
+@certified("minimum inter-event time", "inter_event")
 def inter_event_time(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """The time between two events."""
     if certificate.inter_event_s is None:
@@ -334,7 +347,7 @@ def inter_event_time(run: RunEvidence, samples: Samples, certificate: ScenarioCe
     return least_inter_event_time(run, samples, certificate.inter_event_s, None, label, certificate)
 
 
-@certified("the sensor's error is bounded")
+@certified("the sensor's error is bounded", "e_s")
 def sensor_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖e_s‖_W before each reset."""
     if not certificate.has("e_s"):
@@ -345,7 +358,7 @@ def sensor_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertif
     return ClaimBound(Bound(formula, samples.t_s, shares, None, certificate.first("e_s")))
 
 
-@certified("the state is bounded")
+@certified("the state is bounded", "x")
 def state(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖x‖ at each step of the plant."""
     if not certificate.has("x"):
@@ -383,7 +396,7 @@ def _output_claim(
     """Return the claim of an output's bound, or that it stays within its allowed error from a time on."""
     output, certificate = output_bound.output, output_bound.certificate
 
-    @certified(statement, output.name)
+    @certified(statement, "output", output.name, settles_s)
     def output_claim(run: RunEvidence, samples: Samples, of_loop: ScenarioCertificate) -> ClaimBound:
         observed = np.abs(samples.plant.x @ np.array(output.row))
         slack, t_s = ROUNDING * run.offset, samples.step_s
@@ -402,7 +415,7 @@ def _output_claim(
     return output_claim
 
 
-@certified("x stays in the region")
+@certified("x stays in the region", "region")
 def region(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """The region on which a plant's equations are enclosed, coordinate by coordinate."""
     names, x, proven = run.record.loop.state_names, np.abs(samples.plant.x), certificate.proven

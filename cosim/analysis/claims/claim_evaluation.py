@@ -24,12 +24,20 @@ from cosim.analysis.claims.claim_catalogue import (
     claims_about,
     output_claims,
 )
+from cosim.analysis.claims.guarantee_claims import guarantee_claims
 from cosim.analysis.claims.reference_deviations import deviations
 from cosim.analysis.claims.run_certificates import RunCertificate
 from cosim.analysis.claims.run_evidence import ROUNDING, ClaimEnd, RunEvidence, Samples, earliest
 from cosim.analysis.conformance.common_end import common_end_ns, up_to_common_end
 from cosim.analysis.conformance.recorded_loop import MOST_STEPS
-from cosim.analysis.summary.summary_model import NO_BOUND, Claim, ClaimCause, ClaimVerdict, ConformancePart
+from cosim.analysis.summary.summary_model import (
+    NO_BOUND,
+    Claim,
+    ClaimCause,
+    ClaimKind,
+    ClaimVerdict,
+    ConformancePart,
+)
 from cosim.record.decimation import decimate
 from cosim.record.divergence import largest_reference
 from cosim.record.run_events import changes_of
@@ -42,10 +50,10 @@ from noack.scenario.resolution import loop_of
 from noack.theory.certificates.conditions import NetworkConditions, jump_s
 
 
-def unchecked(claimed: str, source: str, cause: ClaimCause, detail: str = "") -> Claim:
+def unchecked(claimed: str, kind: ClaimKind, source: str, cause: ClaimCause, detail: str = "") -> Claim:
     """Return a claim of which nothing was compared."""
     return Claim(
-        what=claimed, source=source, bound=NO_BOUND, certified=None, observed=None, ratio=None,
+        what=claimed, kind=kind, source=source, bound=NO_BOUND, certified=None, observed=None, ratio=None,
         verdict=ClaimVerdict.UNCHECKED, since_s=0.0, cause=cause, detail=detail, until_s=None,
     )  # fmt: skip
 
@@ -119,12 +127,15 @@ class ClaimCheck:
                 observed = constant / ratio if ratio else None
         text = at_least(constant) if bound.is_lower else at_most(constant)
         return Claim(
-            what=self._claimed.statement, source=self._source, bound=bound.formula.format(text),
+            what=self._claimed.statement, kind=self._claimed.kind, source=self._source,
+            bound=bound.formula.format(text),
             certified=constant, observed=observed, ratio=ratio, verdict=verdict,
             since_s=since_s, cause=cause, detail=detail,
             until_s=round(self.until_s, 9) if math.isfinite(self.until_s) else None,
             proved=self._claimed.is_certified or None,
+            quantity=self._claimed.quantity,
             output=self._claimed.output,
+            settles_s=self._claimed.settles_s,
         )  # fmt: skip
 
 
@@ -240,13 +251,15 @@ class RunClaims:
             return []
         if self.record.scenario.protocol.acknowledges:
             what = "x_c − x_s is the sum of the missed jumps"
-            return [unchecked(what, "(I1)", ClaimCause.ACKNOWLEDGED)]
-        claims = [each.check.result() for each in self._claimed(None)]
+            i1 = unchecked(what, ClaimKind.IDENTITY, "(I1)", ClaimCause.ACKNOWLEDGED)
+            return [*guarantee_claims(self._checked_record), i1]
+        claims = guarantee_claims(self._checked_record)
+        claims += [each.check.result() for each in self._claimed(None)]
         for certificate in self.certified_evidence.certificates:
             claimed = self._claimed(certificate)
             if (cause := self._cause(certificate, has_claims=bool(claimed))) is not None:
                 what = f"a certificate for {certificate.certificate.scope}"
-                claims.append(unchecked(what, certificate.certificate.source, *cause))
+                claims.append(unchecked(what, ClaimKind.CERTIFICATE, certificate.certificate.source, *cause))
             claims += [each.check.result() for each in claimed]
         return claims
 

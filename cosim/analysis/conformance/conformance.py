@@ -25,7 +25,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import lsq_linear, nnls
 
-from cosim.analysis.conformance.document_numbers import TINY, DocumentNumbers, Flow, Split, Table, value
+from cosim.analysis.conformance.document_numbers import (
+    TINY,
+    DocumentNumbers,
+    MotionParts,
+    MotionStep,
+    Table,
+    value,
+)
 from cosim.analysis.conformance.recorded_loop import Flags, Numbers
 from cosim.analysis.conformance.trace import Trace
 from cosim.analysis.conformance.verdicts import Conformance, Failed, Failure
@@ -217,7 +224,7 @@ class _Checked:
             lambda check, here: check(location, split, here), ((self._flows, at), (self._inputs, at))
         )
 
-    def _flows(self, location: Table, split: Split, at: Numbers) -> None:
+    def _flows(self, location: Table, split: MotionParts, at: Numbers) -> None:
         dt_s, u = self._lengths_s(at), self._trace.u[self._trace.rows[at]]
         rounded_s = np.round(dt_s, 9)
         for length in np.unique(rounded_s):
@@ -237,9 +244,9 @@ class _Checked:
     def _explained(
         rest: Vector,
         free: Vector,
-        flow: Flow,
+        flow: MotionStep,
         states: list[int],
-        split: Split,
+        split: MotionParts,
         now: Vector,
         then: Vector,
     ) -> Flags:
@@ -264,7 +271,7 @@ class _Checked:
         explained[open_] = _reachable(effects, rest[np.ix_(open_, moved)] / unit)
         return explained
 
-    def _inputs(self, location: Table, split: Split, at: Numbers) -> None:
+    def _inputs(self, location: Table, split: MotionParts, at: Numbers) -> None:
         name, u = location["name"], self._trace.u[self._trace.rows[at]]
         for ends in (at, at + 1):
             z = self._z(ends)

@@ -18,7 +18,7 @@ TINY = 1e-12
 _PARTS = 8
 
 
-class Split(NamedTuple):
+class MotionParts(NamedTuple):
     """A motion ż = F z + B u + Σ c p with u in the hull of Uᵢ z."""
 
     F: Matrix
@@ -28,7 +28,7 @@ class Split(NamedTuple):
     rows: Sequence[Matrix]
 
 
-class Flow(NamedTuple):
+class MotionStep(NamedTuple):
     """What a motion does in a time: ``state`` z + ``input`` u + ``signals`` p, of constant u and p."""
 
     state: Matrix
@@ -86,7 +86,7 @@ class DocumentNumbers:
         return [i for i in self.states if self.names[i] not in has]
 
     @cached_method
-    def split(self, motion: str) -> Split | None:
+    def split(self, motion: str) -> MotionParts | None:
         """Return the parts of a motion; None: its corners have no common part."""
         corners = self.table["motions"][motion]
         F = [_matrix(corner["matrix"]) for corner in corners]
@@ -95,16 +95,16 @@ class DocumentNumbers:
         columns = np.hstack([_matrix(each["column"]) for each in unknown] or [np.zeros((len(F[0]), 0))])
         rows = [_matrix(each["rows"]) for each in unknown]
         if len(corners) == 1:  # then u is U z, and F has its part
-            return Split(F[0], np.zeros((len(F[0]), len(U[0]))), U, columns, rows)
+            return MotionParts(F[0], np.zeros((len(F[0]), len(U[0]))), U, columns, rows)
         mean_F, mean_U = sum(F) / len(F), sum(U) / len(U)
         differences = np.hstack([each - mean_U for each in U]), np.hstack([each - mean_F for each in F])
         B = differences[1] @ np.linalg.pinv(differences[0])
         if np.abs(B @ differences[0] - differences[1]).max(initial=0) > 1e-6 * (np.abs(mean_F).max() + TINY):
             return None
-        return Split(np.asarray(mean_F - B @ mean_U), B, U, columns, rows)
+        return MotionParts(np.asarray(mean_F - B @ mean_U), B, U, columns, rows)
 
     @cached_method
-    def flow(self, motion: str, length_s: float) -> Flow:
+    def flow(self, motion: str, length_s: float) -> MotionStep:
         """Return what a motion that has a split does in a time."""
         split = self.split(motion)
         assert split is not None
@@ -112,11 +112,11 @@ class DocumentNumbers:
         whole = np.zeros((n + m + k, n + m + k))
         whole[:n, :n], whole[:n, n : n + m], whole[:n, n + m :] = split.F, split.B, split.columns
         moved = expm(whole * length_s)[:n]
-        return Flow(moved[:, :n], moved[:, n : n + m], moved[:, n + m :], _variation(split, length_s))
+        return MotionStep(moved[:, :n], moved[:, n : n + m], moved[:, n + m :], _variation(split, length_s))
 
 
-def _variation(split: Split, length_s: float) -> Matrix:
-    """Return :attr:`Flow.varied`.
+def _variation(split: MotionParts, length_s: float) -> Matrix:
+    """Return :attr:`MotionStep.varied`.
 
     Its effect is ∫ g p ds with g = e^{F(T − s)} c, so this is ∫ |g − mean of g| ds.
     """

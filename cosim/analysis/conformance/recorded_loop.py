@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from cosim.analysis.conformance.input_origins import PlantInputs, plant_inputs
 from cosim.record.rows import Rows, concatenate_rows, pack_rows, with_columns
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
-from noack.core.row_operations import all_entries
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError
+from netem.core.row_operations import all_entries
 from noack.protocol.record_tables import CONTROLLER_STEP, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 
 Numbers = NDArray[np.int64]

@@ -15,8 +15,8 @@ from cosim.analysis.conformance.recorded_loop import Flags, Numbers, RecordedLoo
 from cosim.analysis.conformance.run_document import RunDocument
 from cosim.analysis.conformance.verdicts import EdgeKind, Place, Transition, Unknown
 from cosim.record.rows import Rows
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
+from netem.core.clock import NS_PER_S
+from netem.core.errors import CallerError
 from noack.core.linear_systems import Propagator, Vector
 from noack.core.references import Reference
 from noack.protocol.record_tables import NO_SEQUENCE

@@ -246,7 +246,7 @@ def _share_used(claims: Sequence[Claim]) -> float:
         (
             claim.ratio
             for claim in claims
-            if claim.is_certified and claim.bounds_norm and claim.ratio is not None
+            if claim.is_certified and claim.quantity in ("e_c", "x") and claim.ratio is not None
         ),
         default=0.0,
     )

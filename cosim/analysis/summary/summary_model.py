@@ -336,14 +336,27 @@ class ClaimCause(StrEnum):
 
 
 NO_BOUND = "none"
-_IDENTITY = "(I1)"
 """The formula of a claim that has no bound."""
+
+
+class ClaimKind(StrEnum):
+    """What a claim follows from."""
+
+    CERTIFICATE = "certificate"
+    """It is proved of the loop document of a certificate, and holds as long as the run conforms to it."""
+    GUARANTEE = "guarantee"
+    """It is a rule of the network's guarantee."""
+    IDENTITY = "identity"
+    """It follows from the definitions of the loop, as (I1) does."""
+    PAPER = "paper"
+    """It is a bound of the paper, computed, which assumes an ideal loop."""
 
 
 class Claim(SummaryPart):
     """A claim, checked against the run."""
 
     what: str
+    kind: Annotated[ClaimKind, Field(strict=False)]
     source: str
     bound: str
     """The claim as a formula with its numbers."""
@@ -366,20 +379,25 @@ class Claim(SummaryPart):
     proved: bool | None = None
     """Whether the checker has proven the bound, as that of a certificate. None: it follows from the
     definitions of the loop, or there is no bound."""
+    quantity: str | None = None
+    """What is bounded: ``"e_c"``, ``"e_s"``, ``"estimate"``, ``"x"``, ``"region"``, ``"inter_event"``,
+    ``"losses"`` or ``"output"``; None: nothing of these."""
     output: str | None = None
     """The output that is bounded, by its name; None: something else is."""
+    settles_s: Real = None
+    """From when on the output stays within its allowed error; None: this is not claimed."""
 
     @property
     def origin(self) -> str:
         """The source, and how the bound is known; the identity (I1) is a definition."""
         if self.proved:
             return f"{self.source} (proved)"
-        return f"{self.source} (computed)" if self.has_bound and self.source != _IDENTITY else self.source
+        return f"{self.source} (computed)" if self.kind is ClaimKind.PAPER else self.source
 
     @property
     def is_certified(self) -> bool:
         """Whether it is a claim of a certificate; others follow from the definitions of the loop."""
-        return "certificate" in self.source
+        return self.kind is ClaimKind.CERTIFICATE
 
     @property
     def has_bound(self) -> bool:
@@ -392,14 +410,9 @@ class Claim(SummaryPart):
         return self.is_certified and not self.has_bound
 
     @property
-    def bounds_norm(self) -> bool:
-        """Whether the bound is one of ‖e_c‖ or of ‖x‖."""
-        return self.bound.startswith(("‖e_c‖ ≤", "‖W e_c‖ ≤", "‖x‖ ≤", "‖x − x_r‖ ≤"))
-
-    @property
     def is_lower_bound(self) -> bool:
         """Whether the claimed constant is a lower bound."""
-        return "≥" in self.bound
+        return self.quantity == "inter_event"
 
     @property
     def certified_text(self) -> str | None:

@@ -81,7 +81,7 @@ def test_a_run_exits_with_1_unless_its_verdict_has_what_is_required(
         ([claim("held"), claim("ended", source="box certificate", cause="conformance")], []),
         ([claim("held", source="box certificate"), claim("ended", cause="conformance")], []),
         ([claim("held"), claim("ended", cause="conformance")], ["certificate"]),
-        ([claim("held", source="(I1)")], ["certificate", "guarantee"]),
+        ([claim("held", kind="identity", source="(I1)")], ["certificate", "guarantee"]),
         ([claim("held", until_s=1.0)], ["certificate"]),  # the settings changed
         ([claim("violated")], ["certificate", "guarantee"]),
         ([], ["certificate", "guarantee"]),

@@ -24,7 +24,7 @@ from tests.helpers.summaries import run_of_one_loop, summary_of
 FIGURES = ["states", "errors", "state-norm", "input", "inter-event", "losses"]
 TIMED = ["lateness", "latency"]
 CLAIM = {
-    "what": "controller error", "source": "theorem T", "bound": "‖e_c‖ ≤ 5 β e^(−αt)",
+    "what": "controller error", "kind": "paper", "source": "theorem T", "bound": "‖e_c‖ ≤ 5 β e^(−αt)",
     "certified": 2.5, "observed": 0.4371, "ratio": 0.17484, "verdict": "held", "since_s": None,
     "until_s": None,
 }  # fmt: skip

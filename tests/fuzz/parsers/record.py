@@ -54,9 +54,9 @@ SCENARIO = {
 }  # fmt: skip
 NOTICE = {"t_ns": 10_000_000, "level": "violation", "text": "MANSD violated", "process": "netem"}
 CLAIM = {
-    "what": "the error is bounded", "source": "Theorem 1", "bound": "‖e‖ ≤ 1", "certified": 1.0,
-    "observed": 0.5, "ratio": 0.5, "verdict": "ended", "since_s": 0.01, "cause": "watchdog", "detail": "",
-    "until_s": None,
+    "what": "the error is bounded", "kind": "paper", "source": "Theorem 1", "bound": "‖e‖ ≤ 1",
+    "certified": 1.0, "observed": 0.5, "ratio": 0.5, "verdict": "ended", "since_s": 0.01,
+    "cause": "watchdog", "detail": "", "until_s": None,
 }  # fmt: skip
 IDEAL_LOOP = {"reason": None, "rms_difference": 0.1, "rms_x": 1.0, "events": 1}
 RECORD_KNOWN = Vocabulary(

@@ -49,8 +49,8 @@ def loop() -> LoopSummary:
     return summary
 
 
-def bound(formula: str, ratio: float, source: str = "certificate") -> dict[str, Any]:
-    return claim("held", bound=formula, ratio=ratio, source=source)
+def bound(quantity: str, ratio: float, kind: str = "certificate") -> dict[str, Any]:
+    return claim("held", quantity=quantity, ratio=ratio, kind=kind)
 
 
 FAILED = {"exit": {"status": 1, "reason": "diverged"}}
@@ -59,11 +59,11 @@ FAILED = {"exit": {"status": 1, "reason": "diverged"}}
 @pytest.mark.parametrize(
     ("loops", "number", "reason"),
     [
-        ([{}, FAILED, {"claims": [bound("‖x‖ ≤ 1", 0.9)]}], 1, "diverged"),
-        ([{"claims": [bound("‖x‖ ≤ 1", 0.5)]}, {"claims": [bound("‖W e_c‖ ≤ 1", 0.6)]}], 1, ": 60 %"),
+        ([{}, FAILED, {"claims": [bound("x", 0.9)]}], 1, "diverged"),
+        ([{"claims": [bound("x", 0.5)]}, {"claims": [bound("e_c", 0.6)]}], 1, ": 60 %"),
         # Other bounds do not count: those of times, and those that are computed from the run.
-        ([{"claims": [bound("‖e_c‖ ≤ 1", 0.5)]}, {"claims": [bound("t_(i+1) − t_i ≥ 1 s", 0.9)]}], 0, "50 %"),
-        ([{"claims": [bound("‖e_c‖ ≤ 1", 1.0, "(I1)")], "sup_e_c_norm": 1.0}, {"sup_e_c_norm": 2.0}], 1,
+        ([{"claims": [bound("e_c", 0.5)]}, {"claims": [bound("inter_event", 0.9)]}], 0, "50 %"),
+        ([{"claims": [bound("e_c", 1.0, "identity")], "sup_e_c_norm": 1.0}, {"sup_e_c_norm": 2.0}], 1,
          "largest ‖e_c‖, 2; no loop has a certified bound"),
         ([{"sup_e_c_norm": None}, {"sup_e_c_norm": 0.0}], 1, "largest ‖e_c‖, 0"),
     ],
