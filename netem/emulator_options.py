@@ -16,9 +16,18 @@ from netem.impairments.burst_prediction import USUAL_PACKETS, read_within
 from netem.impairments.link_settings import LinkSettings
 from netem.impairments.target_loss import read_files
 from netem.impairments.words import OWN_TIME_S
-from netem.links_file import load_links
+from netem.links_file import load_links, load_presets
+from netem.presets.preset import Preset, find_preset
 from netem.relay.relay_links import LinkSpec
-from netem.tc_words import GRAMMAR, KEYWORDS, parse, require_no_dashes, settings_of
+from netem.tc_words import (
+    GRAMMAR,
+    KEYWORDS,
+    parse,
+    preset_names,
+    require_no_dashes,
+    reverse_words,
+    settings_of,
+)
 
 LINK_NAME = "relay"
 """Name of the link that the command line describes."""
@@ -51,6 +60,9 @@ settings, at any place:
   first      the first datagram of each flow is delivered
   limit N    at most N datagrams are delayed at a time
   seed N     seed of the link's random streams
+
+  like NAME  the words of a preset, in each direction those that it has for it, e.g.
+             like dsl mansd 4; or of a file: like ./NAME.toml
 
 A flow is the datagrams from one client (address and port), or the answers to it.
 
@@ -106,6 +118,7 @@ def command_line_parser() -> Parser:
         "                   [WORDS ...] [options]\n"
         "       %(prog)s --links FILE.toml [options]\n"
         "       %(prog)s --explain WORDS ...\n"
+        "       %(prog)s --presets\n"
         "       %(prog)s shell [WORDS ...] [options] [-- COMMAND]\n"
         "       %(prog)s show|set|watch [NAME] ...",
         description="A UDP relay that emulates a network, configured in the syntax of `tc netem`. "
@@ -128,6 +141,9 @@ def command_line_parser() -> Parser:
     links.add_argument("--one-way", action="store_true", help="do not relay the server's answers")
     links.add_argument(
         "--explain", action="store_true", help="explain the words, or the links of a file, and exit"
+    )
+    links.add_argument(
+        "--presets", action="store_true", help="list the presets: what like NAME stands for, and its source"
     )
     links.add_argument(
         "--within",
@@ -232,6 +248,14 @@ def specs_of(options: argparse.Namespace, *, read: bool = True) -> tuple[LinkSpe
     )
 
 
+def presets_of(options: argparse.Namespace) -> tuple[Preset, ...]:
+    """Return the presets that a command line names, which has been read without a mistake."""
+    if options.links is not None:
+        return load_presets(options.links)
+    names = (*preset_names(options.words or ()), *preset_names(options.reverse or ()))
+    return tuple(map(find_preset, dict.fromkeys(names)))
+
+
 def explained_packets(options: argparse.Namespace) -> int:
     """Return how many packets the explanation's chance of a long loss burst is for.
 
@@ -280,13 +304,19 @@ def _idle_s(text: str | None) -> float:
 
 def _directions(options: argparse.Namespace) -> tuple[LinkSettings, LinkSettings, int]:
     """Return the forward and the reverse settings, and the seed; files are not read yet."""
-    forward, seed = parse(options.words or ())
+    forward, seed, presets = parse(options.words or ())
     if options.both and options.reverse is not None:
         raise CallerError("--reverse and --both exclude each other")
     if getattr(options, "one_way", False) and (options.both or options.reverse is not None):
         raise CallerError("--one-way: no reverse direction; leave out --reverse and --both")
-    reverse = settings_of(options.reverse) if options.reverse is not None else LinkSettings()
+    if options.both:
+        reverse = parse(options.words or (), direction="reverse").settings
+    elif options.reverse is not None:
+        reverse = settings_of(options.reverse, direction="reverse")
+    else:
+        is_one_way = getattr(options, "one_way", False)
+        reverse = settings_of("" if is_one_way else reverse_words(presets), direction="reverse")
     if seed is not None and options.seed is not None:
         raise CallerError(f"--seed {options.seed}: the words have seed {seed} already")
     seed = options.seed if seed is None else seed
-    return forward, forward if options.both else reverse, whole_number("seed", seed or 0, 0, LARGEST_SEED)
+    return forward, reverse, whole_number("seed", seed or 0, 0, LARGEST_SEED)

@@ -21,6 +21,8 @@ from netem.impairments.loss_prediction import order_and_notes
 from netem.impairments.markov_chain import NotPredictableError
 from netem.impairments.target_loss import expected_loss, loss_process, with_target_loss
 from netem.impairments.words import percent_text
+from netem.presets.preset import Preset
+from netem.presets.preset_text import print_explanation
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import words_of
 
@@ -31,13 +33,20 @@ _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 
 
 def explain(
-    specs: Sequence[LinkSpec], as_written: Sequence[LinkSpec], *, as_json: bool, as_file: bool, packets: int
+    specs: Sequence[LinkSpec],
+    as_written: Sequence[LinkSpec],
+    presets: Sequence[Preset] = (),
+    *,
+    as_json: bool,
+    as_file: bool,
+    packets: int,
 ) -> None:
     """Print the effect of links' settings on standard output, as tables or as JSON.
 
     Args:
         specs: the links.
         as_written: the same links, with the names of files instead of their content: what tables show.
+        presets: the presets that the words name.
         as_json: JSON, with the content.
         as_file: tables have the links as a file of links instead of their names.
         packets: how many packets the chance of a long loss burst is for.
@@ -54,9 +63,12 @@ def explain(
             }
             for spec in specs
         ]
-        print(json.dumps({"links": links}))
+        named = {"presets": [preset.content() for preset in presets]} if presets else {}
+        print(json.dumps(named | {"links": links}))
         return
     console = SafeConsole(highlight=False)
+    for preset in presets:
+        print_explanation(console, preset)
     for number, (spec, written_spec) in enumerate(zip(specs, as_written, strict=True)):
         if number:
             console.print()

@@ -1,34 +1,49 @@
 """The file of links: several links of one relay, as TOML; see :class:`LinksFile`."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
+from pydantic import BeforeValidator, Field, FiniteFloat, ValidationInfo, model_validator
 from pydantic_core import to_json
 
 from netem.core import toml_file
 from netem.core.address import parse_address, parse_destination
 from netem.core.errors import CallerError
-from netem.core.settings_section import FolderName, ScenarioSection, Seed, Table
+from netem.core.settings_section import FolderName, ReadTable, ScenarioSection, Seed, Table
 from netem.impairments.link_settings import LinkSettings
 from netem.impairments.target_loss import read_files
+from netem.presets.preset import Direction, Preset, find_preset
 from netem.relay.relay_links import STREAM, LinkSpec
-from netem.tc_words import settings_of
+from netem.tc_words import preset_names, reverse_words, settings_of
 
 
-def _settings(value: object) -> LinkSettings:
+def _settings(value: object, info: ValidationInfo) -> LinkSettings:
     if isinstance(value, LinkSettings):
         return value
     if not isinstance(value, str):
         # Strict validation accepts lists for tuples only in JSON, so that this goes through JSON.
         return LinkSettings.model_validate_json(to_json(value))
     try:
-        return settings_of(value)
+        direction: Direction = "reverse" if info.field_name == "reverse" else "forward"
+        return settings_of(value, direction=direction, folder=_folder(info))
     except CallerError as error:
         raise ValueError(str(error)) from None
 
 
+def _folder(info: ValidationInfo) -> Path:
+    """Return the folder of the file of links."""
+    return info.context if isinstance(info.context, Path) else Path()
+
+
 Side = Annotated[LinkSettings, BeforeValidator(_settings, json_schema_input_type=str | LinkSettings)]
+
+
+def presets_of_table(table: ReadTable) -> tuple[str, ...]:
+    """Return the presets that a link's table names in its words, each once."""
+    words = (table.get(key) for key in ("words", "forward", "reverse"))
+    names = (name for text in words if isinstance(text, str) for name in preset_names(text))
+    return tuple(dict.fromkeys(names))
 
 
 class LinkTable(ScenarioSection):
@@ -43,7 +58,8 @@ class LinkTable(ScenarioSection):
     forward: Side = LinkSettings()
     """From clients to the server: words, e.g. "delay 10ms loss 5%", or a table."""
     reverse: Side = LinkSettings()
-    """From the server to the clients: words or a table, as for forward."""
+    """From the server to the clients: words or a table, as for forward. Without this key: nothing, or
+    the words of the presets that forward names (like NAME)."""
     words: Side | None = None
     """Another name for forward."""
     seed: Seed | None = None
@@ -54,6 +70,19 @@ class LinkTable(ScenarioSection):
     """A client without a datagram in either direction for this time, in seconds, is removed."""
     most_clients: Annotated[int, Field(ge=1, le=1_000_000)] = LinkSpec.most_clients
     """Maximum number of clients; datagrams of further clients are refused and counted."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_reverse(cls, table: object, info: ValidationInfo) -> object:
+        """Give the reverse direction the words of the presets that the forward direction names."""
+        if not isinstance(table, dict) or "reverse" in table or table.get("return_path") is False:
+            return table
+        presets = presets_of_table(table)
+        with suppress(CallerError):  # that of the forward direction is reported
+            for name in presets:
+                find_preset(name, _folder(info))
+            return table | {"reverse": reverse_words(presets)} if presets else table
+        return table
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -109,7 +138,7 @@ def load_links(path: Path, *, read: bool = True) -> tuple[LinkSpec, ...]:
     if "link" not in content and not content.keys().isdisjoint(("model", "axes")):
         kind = "scenario" if "model" in content else "campaign"
         raise CallerError(f"{path}: a {kind}, not a file of links; it has no [[link]]")
-    links = toml_file.validated(LinksFile, content, str(path)).link
+    links = toml_file.validated(LinksFile, content, str(path), path.parent).link
     specs = tuple(
         link.spec(path.parent, f"{path}: link.{number}", number, read=read)
         for number, link in enumerate(links)
@@ -123,6 +152,14 @@ def load_links(path: Path, *, read: bool = True) -> tuple[LinkSpec, ...]:
             )
         listening[spec.listen] = spec.name
     return specs
+
+
+def load_presets(path: Path) -> tuple[Preset, ...]:
+    """Return the presets that a file of links names, which has been read without a mistake."""
+    tables = toml_file.read(path, LinksFile)["link"]
+    assert isinstance(tables, list)
+    names = dict.fromkeys(name for table in tables for name in presets_of_table(table))
+    return tuple(find_preset(name, path.parent) for name in names)
 
 
 def json_schema() -> Table:

@@ -23,7 +23,7 @@ from netem.impairments.target_loss import read_files
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, Direction
-from netem.tc_words import settings_of
+from netem.tc_words import preset_names, reverse_words, settings_of
 
 
 class LossyUdp:
@@ -45,7 +45,8 @@ class LossyUdp:
     Args:
         to: the server: host and port, or ``"host:port"``.
         words: what happens to datagrams of clients, in the words of ``noack netem``.
-        reverse: what happens to the server's answers; nothing by default.
+        reverse: what happens to the server's answers; by default nothing, or what the presets say
+            that ``words`` name (``like dsl``).
         seed: seed of the random streams.
         listen: where clients send to; port 0 selects a free port.
         name: name of the link in reports.
@@ -59,7 +60,7 @@ class LossyUdp:
         to: str | Sequence[str | int],
         words: str = "",
         *,
-        reverse: str = "",
+        reverse: str | None = None,
         seed: int = 0,
         listen: str | Sequence[str | int] = "127.0.0.1:0",
         name: str = "relay",
@@ -67,7 +68,9 @@ class LossyUdp:
         seed = whole_number("seed", seed, 0, LARGEST_SEED)
         listen_at = parse_address(_text(listen, "listen"), "listen")
         server = parse_destination(_text(to, "to"), "to", listen_at)
-        forward_settings, reverse_settings = _settings(words, "words"), _settings(reverse, "reverse")
+        forward_settings = _settings(words, "words")
+        answers = reverse_words(preset_names(words)) if reverse is None else reverse
+        reverse_settings = _settings(answers, "reverse", "reverse")
         self._spec = LinkSpec(name, listen_at, server, forward_settings, reverse_settings, seed)
         self._opening: Future[tuple[CommandQueue, Address]] = Future()
         self._last_snapshot: Snapshot | None = None
@@ -132,7 +135,9 @@ class LossyUdp:
         if unknown := [direction for direction in directions if direction not in DIRECTIONS]:
             raise CallerError(f"directions: {unknown[0]!r}; the directions are forward and reverse")
         commands, _ = self._running()
-        commands.change(self._spec.name, dict.fromkeys(directions, _settings(words, "words")))
+        commands.change(
+            self._spec.name, {direction: _settings(words, "words", direction) for direction in directions}
+        )
 
     def __str__(self) -> str:
         """Where the link leads, its settings, and what was lost."""
@@ -185,7 +190,7 @@ def _text(address: str | Sequence[str | int], argument: str) -> str:
     raise CallerError(f"{argument}: {address!r}; give host and port, or 'host:port'")
 
 
-def _settings(words: str, argument: str) -> LinkSettings:
+def _settings(words: str, argument: str, direction: Direction = "forward") -> LinkSettings:
     if not isinstance(words, str):
         raise CallerError(f"{argument}: {words!r}; give words such as 'loss 30% mansd 4'")
-    return read_files(settings_of(words), Path())
+    return read_files(settings_of(words, direction=direction), Path())

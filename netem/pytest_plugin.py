@@ -62,7 +62,7 @@ def lossy_udp(request: pytest.FixtureRequest) -> Iterator[Callable[..., LossyUdp
             to: str | Sequence[str | int],
             words: str = "",
             *,
-            reverse: str = "",
+            reverse: str | None = None,
             seed: int | None = None,
             listen: str | Sequence[str | int] = "127.0.0.1:0",
         ) -> LossyUdp:

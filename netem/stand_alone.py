@@ -20,8 +20,10 @@ from netem.core.command_line import Parser, Signals, log_event, log_format, repo
 from netem.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from netem.core.number_format import counted
 from netem.core.realtime_settings import realtime
-from netem.emulator_options import command_line_parser, explained_packets, parse_options, specs_of
+from netem.emulator_options import command_line_parser, explained_packets, parse_options, presets_of, specs_of
 from netem.explanation import explain
+from netem.presets.preset import shipped_presets
+from netem.presets.preset_text import print_list
 from netem.relay.link_sockets import raise_file_limit
 from netem.relay.relay import Relay
 from netem.relay.relay_links import DeviceLink, LinkSpec
@@ -75,11 +77,21 @@ def run_stand_alone(arguments: Sequence[str], parser: Parser | None = None) -> E
     parser = parser or command_line_parser()
     add_relay_options(parser)
     options = parse_options(parser, arguments)
+    if options.presets:
+        print_list(shipped_presets().values(), as_json=options.json)
+        return ExitStatus.OK
     specs = specs_of(options)
     packets = explained_packets(options)
     if options.explain:
         specs_as_written = specs_of(options, read=False)
-        explain(specs, specs_as_written, as_json=options.json, as_file=options.links is None, packets=packets)
+        explain(
+            specs,
+            specs_as_written,
+            presets_of(options),
+            as_json=options.json,
+            as_file=options.links is None,
+            packets=packets,
+        )
         return ExitStatus.OK
     with log_format(options.log_format):
         try:

@@ -1,13 +1,19 @@
 """Converts words to settings and back: the words of ``tc netem``, and additional ones.
 
     delay 10ms 2ms distribution normal loss gemodel 1% 10% mansd 4
+    like dsl mansd 4
+
+``like NAME`` stands for the words of a preset (:mod:`netem.presets`).
 
 The order of the words is the order of the impairments; the position of ``mansd``, ``atmost``,
 ``recover``, ``first``, ``limit`` and ``seed`` does not matter. Words cannot be abbreviated.
 """
 
 import json
+import shlex
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -20,6 +26,7 @@ from netem.impairments.kinds import IMPAIRMENTS, AnyImpairment
 from netem.impairments.kinds.reorder import Reorder
 from netem.impairments.link_settings import LinkSettings
 from netem.impairments.words import COUNT, WordReader
+from netem.presets.preset import Direction, find_preset
 
 T = TypeVar("T")
 _REFUSED = {
@@ -35,7 +42,8 @@ _CLAUSES = {
     for name in (clause.word, *clause.synonyms)
 }
 _SETTINGS = {"mansd": "mansd", "first": "first_delivered", "limit": "limit"}
-KEYWORDS = (*_CLAUSES, *_SETTINGS, "seed")
+_LIKE, _PRESET_NAME = "like", "the name of a preset, or its file NAME.toml"
+KEYWORDS = (*_CLAUSES, *_SETTINGS, "seed", _LIKE)
 """Words that begin a clause."""
 _WORDS = [word for kind in _KINDS for clause in kind.clauses for word in clause.list_words()]
 _AFTER = {
@@ -49,6 +57,7 @@ EXAMPLES: Mapping[str, str] = {
     "mansd": "mansd 4",
     "first": "first",
     "limit": "limit 1000",
+    _LIKE: "like dsl",
 }
 """By word; ``seed`` is missing because it is also an option."""
 GRAMMAR = [
@@ -70,17 +79,30 @@ class LinkWords(NamedTuple):
     settings: LinkSettings
     seed: int | None
     """Seed of the random streams, if the words contain one."""
+    presets: tuple[str, ...] = ()
+    """The presets that the words name."""
 
 
-def parse(words: str | Sequence[str], expected: Collection[str] = KEYWORDS) -> LinkWords:
+def parse(
+    words: str | Sequence[str],
+    expected: Collection[str] = KEYWORDS,
+    *,
+    direction: Direction = "forward",
+    folder: Path = Path(),
+) -> LinkWords:
     """Read the settings of one direction of a link; see :class:`WordReader`.
 
-    ``expected`` has the words that are named in place of an unknown one.
+    Args:
+        words: the words.
+        expected: the words that are named in place of an unknown one.
+        direction: a preset stands for its words of this direction.
+        folder: the file of a preset is relative to it.
 
     Raises:
         CallerError: one line with the wrong word, the expected words, and the nearest known word.
     """
     reader = WordReader(words)
+    presets: list[str] = []
     impairments: list[Impairment] = []
     constraints: list[Constraint] = []
     settings: dict[str, int] = {}
@@ -91,6 +113,10 @@ def parse(words: str | Sequence[str], expected: Collection[str] = KEYWORDS) -> L
             reader.wrong(f"goes right after {_AFTER[word]}")
         if word not in KEYWORDS:
             reader.unknown(word, expected)
+        if word == _LIKE:
+            presets.append(reader.file(_PRESET_NAME))
+            reader.insert(_preset_words(reader, presets[-1], direction, folder))
+            continue
         if word in _CLAUSES:
             kind, clause = _CLAUSES[word]
             table = {"kind": kind.model_fields["kind"].default, **clause.read(reader)}
@@ -112,7 +138,7 @@ def parse(words: str | Sequence[str], expected: Collection[str] = KEYWORDS) -> L
     content: Table = {_SETTINGS[word]: value for word, value in settings.items()}
     content |= {"impairments": tuple(impairments), "constraints": tuple(constraints)}
     try:
-        return LinkWords(LinkSettings.model_validate(content), seed)
+        return LinkWords(LinkSettings.model_validate(content), seed, tuple(presets))
     except ValidationError as error:
         # Each setting is valid by itself; the error is a combination of settings.
         key, _, message = _message(error).partition(": ")
@@ -120,16 +146,52 @@ def parse(words: str | Sequence[str], expected: Collection[str] = KEYWORDS) -> L
         raise CallerError(f"{word}{message}") from None
 
 
-def settings_of(words: str | Sequence[str], expected: Collection[str] = KEYWORDS) -> LinkSettings:
+def settings_of(
+    words: str | Sequence[str],
+    expected: Collection[str] = KEYWORDS,
+    *,
+    direction: Direction = "forward",
+    folder: Path = Path(),
+) -> LinkSettings:
     """Read the settings of one direction of a link from words without a seed.
 
     Raises:
         CallerError: as :func:`parse`, or the words contain a seed.
     """
-    settings, seed = parse(words, expected)
+    settings, seed, _ = parse(words, expected, direction=direction, folder=folder)
     if seed is not None:
         raise CallerError(f"seed {seed}: belongs to the link, not to one of its directions")
     return settings
+
+
+def preset_names(words: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the presets in words, up to a word that is wrong."""
+    reader, names = WordReader(words), list[str]()
+    with suppress(CallerError):
+        while (word := reader.begin()) is not None:
+            if word == _LIKE:
+                names.append(reader.file(_PRESET_NAME))
+    return tuple(names)
+
+
+def reverse_words(presets: Sequence[str]) -> str:
+    """Return the words of the reverse direction, where none are given, of a link with presets."""
+    return " ".join(f"{_LIKE} {shlex.quote(name)}" for name in presets)
+
+
+def _preset_words(reader: WordReader, name: str, direction: Direction, folder: Path) -> str:
+    """Return the words that a preset stands for; raise CallerError if they are wrong."""
+    try:
+        words = find_preset(name, folder).words(direction)
+    except CallerError as error:
+        reader.wrong(str(error))
+    try:
+        if preset_names(words):
+            raise CallerError("a preset cannot name another preset")
+        settings_of(words)
+    except CallerError as error:
+        reader.wrong(f"{direction}: {error}")
+    return words
 
 
 def words_of(settings: LinkSettings) -> str:

@@ -4,25 +4,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, get_args
 
-import numpy as np
-
 from cosim.record.run_directory import require_output, write_output
 from netem.core import toml_file
 from netem.core.errors import printable
 from netem.core.file_access import require_suffix
 from netem.core.number_checks import one_of
 from netem.impairments.target_loss import read_files
-from netem.measurement.chain_fits import ChainFit
+from netem.measurement.fitted_network import fitted_impairments, fitted_loss
 from netem.measurement.network_measurement import NetworkMeasurement
 from netem.traces.packet_trace import LOST_NS, PacketTrace
 from noack.scenario.scenario_file import toml_text
 from noack.scenario.sections import NetworkSection
 
 Form = Literal["trace", "model"]
-_SAMPLES = 101
-"""Number of delay quantiles of a model."""
-_MOST_CORRELATION = 0.99
-"""The emulator requires less than 1."""
 
 
 def write_network(measurement: NetworkMeasurement, path: Path, form: Form) -> list[Path]:
@@ -91,44 +85,4 @@ def _trace_section(measurement: NetworkMeasurement, name: str) -> Mapping[str, o
 
 
 def _model_section(measurement: NetworkMeasurement) -> Mapping[str, object]:
-    loss = _loss(measurement.chosen.fit) if measurement.models else {"model": "lossless"}
-    return {"loss": loss, "impairments": [*_outage_chain(measurement), *_delay(measurement)]}
-
-
-def _loss(fit: ChainFit) -> Mapping[str, object]:
-    if fit.model == "bernoulli":
-        return {"model": "bernoulli", "probability": fit.rates.loss_in_bad}
-    return {"model": "gilbert_elliott", **fit.rates._asdict()}
-
-
-def _outage_chain(measurement: NetworkMeasurement) -> list[Mapping[str, object]]:
-    """Return the outages as a chain of their own, by packets."""
-    lengths = measurement.bursts.length[measurement.is_outage]
-    if not len(lengths):
-        return []
-    usual = len(measurement.trace) - int(lengths.sum())
-    chain = {
-        "model": "gilbert_elliott",
-        "good_to_bad": min(len(lengths) / max(usual, 1), 1.0),
-        "bad_to_good": 1 / float(lengths.mean()),
-    }
-    return [{"kind": "loss", "loss": chain}]
-
-
-def _delay(measurement: NetworkMeasurement) -> list[Mapping[str, object]]:
-    """Return the delays of the effective packets; the others are lost in the model."""
-    delays_ns = measurement.trace.delay_ns[measurement.outcomes.effective]
-    if not len(delays_ns) or not delays_ns.any():
-        return []
-    if delays_ns.min() == delays_ns.max():
-        return [{"kind": "delay", "delay_s": int(delays_ns[0]) * 1e-9}]
-    samples_s = np.quantile(delays_ns, np.linspace(0, 1, _SAMPLES)) * 1e-9
-    correlation = next(iter(measurement.delays.correlation.at_lags), 0.0)
-    return [
-        {
-            "kind": "delay",
-            "distribution": "empirical",
-            "samples_s": np.round(samples_s, 9).tolist(),
-            "correlation": round(min(max(correlation, 0.0), _MOST_CORRELATION), 4),
-        }
-    ]
+    return {"loss": fitted_loss(measurement), "impairments": [*fitted_impairments(measurement)]}

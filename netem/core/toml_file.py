@@ -95,8 +95,11 @@ def parsed(text: str, source: str) -> Table:
         raise CallerError(printable(f"{source}: not valid TOML: {_with_line(text, str(error))}")) from None
 
 
-def validated(model: type[M], content: ReadTable, source: str) -> M:
-    """Validate parsed content; raise CallerError with one line per mistake, named by ``source``."""
+def validated(model: type[M], content: ReadTable, source: str, folder: Path | None = None) -> M:
+    """Validate parsed content; raise CallerError with one line per mistake, named by ``source``.
+
+    Validators have ``folder`` as their context: names of files are relative to it.
+    """
     require_levels(content, source)
     try:
         text = json.dumps(content, default=_unfit)
@@ -106,7 +109,7 @@ def validated(model: type[M], content: ReadTable, source: str) -> M:
         raise CallerError(f"{source}: {TOO_LARGE}") from None
     try:
         # Via JSON, because strict validation accepts an array as a tuple only there.
-        return model.model_validate_json(text)
+        return model.model_validate_json(text, context=folder)
     except ValidationError as error:
         raise CallerError("\n".join(explain(error, source, model))) from None
 

@@ -275,6 +275,10 @@ class WordReader:
         """Read the next word if it is one of these; return it, or None."""
         return self._take() if self._peek() in words else None
 
+    def insert(self, words: str) -> None:
+        """Put words before those that follow."""
+        self._words.extendleft(reversed(_separate(words)))
+
     def unknown(self, word: str, known_words: Collection[str]) -> NoReturn:
         """Raise a CallerError for an unknown word; name the nearest known word."""
         longer = sorted(name for name in known_words if name.startswith(word))

@@ -180,7 +180,7 @@ def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace
 
 _LINES = re.compile(rb"(?:[0-9]{1,15}[ \t]*\r?\n)+[0-9]{0,15}")
 _PROBE_BYTES = 100
-_MOST_PROBES = 5_000_000
+_MOST_PROBES = _MOST_IN_FLIGHT = 1_000_000
 
 
 def is_opportunity_file(head: bytes) -> bool:
@@ -202,7 +202,12 @@ def read_opportunities(path: Path, period_ns: int) -> PacketTrace:
             f"{path}: {opportunities.length_ns / 1e9:g} s are {probes} datagrams of the simulated probe; "
             f"expected 1 to {_MOST_PROBES}; choose another --rate"
         )
-    link = LinkState(LinkSettings(impairments=(opportunities,), mansd=None), 0, "link", "forward")
+    link = LinkState(
+        LinkSettings(impairments=(opportunities,), mansd=None, limit=min(max(probes, 1), 1_000_000)),
+        0,
+        "link",
+        "forward",
+    )
     link.start_flow(0, 0)
     sent_ns = np.arange(probes) * period_ns
     received_ns = np.full(probes, LOST_NS)

@@ -39,8 +39,9 @@ def fill(folder: Path) -> Path:
     """Give a folder the repository's files and a short run; return it."""
     (folder / "scenarios").symlink_to(ROOT / "scenarios")
     (folder / "docs").symlink_to(ROOT / "docs")
-    (links,) = blocks("docs/netem.md", "toml")
+    links, preset = blocks("docs/netem.md", "toml")
     (folder / "links.toml").write_text(links)
+    (folder / "office.toml").write_text(preset)
     for code in [*blocks("docs/plants.md", "python"), *blocks("docs/plants.md", "toml")]:
         if (named := re.match(r"# (\w+\.(?:py|toml))\n", code)) is not None:
             (folder / named[1]).write_text(code)

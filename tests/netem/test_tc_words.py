@@ -12,7 +12,7 @@ from tests.netem.impairments.any_link_settings import settings, words_can_say
 
 def test_words_are_the_approved_impairments() -> None:
     def impairments(words: str) -> list[str]:
-        parsed, seed = parse(words)
+        parsed, seed, _ = parse(words)
         assert seed is None
         assert settings_of(words_of(parsed)) == parsed
         return [impairment.model_dump_json(exclude_unset=True) for impairment in parsed.impairments]
@@ -22,7 +22,7 @@ def test_words_are_the_approved_impairments() -> None:
 
 def test_settings_may_come_anywhere_and_impairments_keep_their_order() -> None:
     words = "mansd 4 delay 10ms limit 50 loss 5% seed 7 delay 1ms first"
-    settings, seed = parse(words)
+    settings, seed, _ = parse(words)
     assert (settings.mansd, settings.limit, settings.first_delivered, seed) == (4, 50, True, 7)
     assert [impairment.kind for impairment in settings.impairments] == ["delay", "loss", "delay"]
     assert words_of(settings) == "delay 10ms loss 5% delay 1ms mansd 4 first limit 50"
