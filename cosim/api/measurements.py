@@ -70,6 +70,8 @@ def measure(
     shares: Sequence[float] | None = None,
     windows: Sequence[int] | None = None,
     within: str | int | None = None,
+    interval_s: float | None = None,
+    survival_s: float | None = None,
     flow: int = 1,
     far_flow: int | None = None,
     sequence_at: str | None = None,
@@ -92,6 +94,8 @@ def measure(
         shares: shares of loss bursts and packets for which M is given.
         windows: K of the (m, K) table.
         within: packets, or a time such as ``"600s"``, for the chance of a long loss burst.
+        interval_s: transfer interval of a service; by default the period of the trace.
+        survival_s: its survival time, for ``observed_availability`` and ``predicted_availability``.
         flow: which flow of a capture; 1 is the largest.
         far_flow: which flow of a capture has the far end of the datagrams.
         sequence_at: where the payloads of a capture have sequence numbers, ``OFFSET:BYTES[:little]``.
@@ -114,6 +118,8 @@ def measure(
         QUANTILES if shares is None else _several(shares),
         WINDOWS if windows is None else _several(windows),
         outage_s,
+        interval_s,
+        survival_s,
         str(USUAL_PACKETS if within is None else within),
     )
     name = " ".join(str(Path(source)) for source in sources)

@@ -20,7 +20,15 @@ from cosim.output.figures.palette import Colour
 from cosim.output.result_tables import KEY_VALUE, ResultTable
 from netem.core.errors import CallerError
 from netem.core.file_access import require_suffix
-from netem.core.number_format import NONE, duration, number, percent
+from netem.core.number_format import (
+    NONE,
+    availability_percent,
+    counted,
+    duration,
+    long_duration,
+    number,
+    percent,
+)
 from netem.impairments.burst_prediction import chance_text
 from netem.measurement.interval_estimates import LEVEL, IntervalEstimate
 from netem.measurement.loss_bursts import histogram, most_losses
@@ -149,6 +157,13 @@ def measurement_tables(
     if measurement.models:
         heads = ("model and parameter", *estimates)
         yield ResultTable("models", f"loss models{suffix}", heads, [*_model_rows(measurement)])
+    if (service := measurement.service) is not None:
+        heads = ("", *estimates)
+        caption = (
+            f"availability for a transfer interval of {duration(service.interval_s)} and a survival time of "
+            f"{duration(service.survival_s)}: {service.survived} losses in a row are survived"
+        )
+        yield ResultTable("availability", caption, heads, [*_availability_rows(measurement, suffix)])
     heads = ("parameter", *estimates)
     yield ResultTable("outages", "model of the outages", heads, [*_outage_rows(measurement)])
     if void is not None:
@@ -221,6 +236,30 @@ def _estimate(estimate: IntervalEstimate | None) -> tuple[str, str]:
     if estimate is None:
         return "not determined", ""
     return number(estimate.value), f"{number(estimate.low)} to {number(estimate.high)}"
+
+
+def _availability_rows(measurement: NetworkMeasurement, suffix: str) -> Iterator[tuple[str, str, str]]:
+    """Yield rows for the trace, with intervals, and for the preferred model."""
+    observed = measurement.observed_availability
+    yield "in the trace", f"{counted(observed.messages, 'message')}", ""
+    value, low, high = observed.availability
+    interval = "" if low is None or high is None else f"{_available(low)} to {_available(high)}"
+    yield "  availability", _available(value), interval or "not known: no failure to measure"
+    yield "  failures", str(observed.failures), ""
+    value, low, high = observed.mean_time_between_failures_s
+    shown = long_duration(value) if observed.failures else "no failure"
+    until = "" if high is None else f" to {long_duration(high)}"
+    yield "  mean time between failures", shown, f"{'from ' * (not until)}{long_duration(low or 0.0)}{until}"
+    predicted, fit = measurement.predicted_availability, measurement.availability_model
+    if predicted is None or fit is None:
+        return
+    yield f"by the preferred model ({_MODELS[fit.model]}){suffix}", "", ""
+    yield "  availability", availability_percent(predicted.unavailability), "exact for the model"
+    yield "  mean time between failures", long_duration(predicted.mean_time_between_failures_s), ""
+
+
+def _available(share: float) -> str:
+    return availability_percent(1 - share)
 
 
 def _outage_rows(measurement: NetworkMeasurement) -> Iterator[tuple[str, str, str]]:

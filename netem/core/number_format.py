@@ -76,6 +76,26 @@ def duration(value_s: float) -> str:
     return _without_zeros(with_unit(value_s * 1e9, ("s", "ms", "µs", "ns")))
 
 
+_LONG_TIMES_S = (("years", 365.25 * 86400.0), ("days", 86400.0), ("h", 3600.0))
+
+
+def long_duration(value_s: float) -> str:
+    """Write a time as :func:`duration` does, from 1 h on with three digits in h, days or years."""
+    for unit, length_s in _LONG_TIMES_S:
+        if value_s >= length_s:
+            return f"{number(value_s / length_s)} {unit}"
+    return duration(value_s)
+
+
+def availability_percent(unavailability: float) -> str:
+    """Write 1 − ``unavailability`` in percent, with two digits behind its nines."""
+    if not 0 < unavailability < 1:
+        return f"{100 * (1 - unavailability):g} %"
+    decimals = max(1 - math.floor(math.log10(100 * unavailability)), 2)
+    exact = 100 - Decimal(f"{100 * unavailability:.3g}")
+    return f"{exact.quantize(Decimal(1).scaleb(-min(decimals, 15)), ROUND_FLOOR, _WIDE_CONTEXT):f} %"
+
+
 def duration_at_least(value_s: float) -> str:
     """Write a lower bound of a time as :func:`duration` does, rounded down."""
     return duration(float(at_least(value_s, _TIME_DIGITS)))

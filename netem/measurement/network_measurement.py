@@ -20,6 +20,15 @@ from netem.impairments.burst_prediction import (
     read_within,
 )
 from netem.impairments.loss_prediction import LossProcess
+from netem.measurement.availability import (
+    ChainAvailability,
+    ObservedAvailability,
+    Service,
+    chain_availability,
+    message_indices,
+    observed_availability,
+    to_json,
+)
 from netem.measurement.chain_fits import MOST_FITTED, ChainFit, ChainFits, FitTest
 from netem.measurement.interval_estimates import LEVEL, IntervalEstimate
 from netem.measurement.loss_bursts import (
@@ -161,6 +170,10 @@ class MeasurementOptions:
     """K of the (m, K) table."""
     outage_s: float | None = None
     """Bursts of this duration or more are outages; None: the statistical rule."""
+    interval_s: float | None = None
+    """Transfer interval of a service, of which the availability is measured; None: the trace's period."""
+    survival_s: float | None = None
+    """Its survival time; None: no availability is measured."""
     within: str = str(USUAL_PACKETS)
     """Packets, or a time, within which the chance of a long loss burst is given."""
 
@@ -169,6 +182,8 @@ class MeasurementOptions:
         for name, time_s in (("deadline", self.deadline_s), ("outage", self.outage_s)):
             if time_s is not None:
                 real_number(name, time_s, above=0.0, most=_LONGEST_S)
+        if self.interval_s is not None and self.survival_s is None:
+            raise CallerError("--interval: is the transfer interval of a service; give --survival, too")
         for share in self.quantiles:
             real_number("share", share, above=0.0, most=1.0)
         for window in self.windows:
@@ -212,7 +227,7 @@ class NetworkMeasurement:
 
     def __post_init__(self) -> None:
         """Refuse a deadline without delays, and a wrong time or number of packets."""
-        _ = self._predicted_packets
+        _ = self._predicted_packets, self.service
         if self.options.deadline_s is not None:
             self.require_delays("a deadline (--deadline)")
 
@@ -337,6 +352,41 @@ class NetworkMeasurement:
         except ValueError as error:
             raise CallerError(f"--within {self.options.within}: {error}") from None
 
+    @cached_property
+    def service(self) -> Service | None:
+        """The service of which the availability is measured, if there is one."""
+        if self.options.survival_s is None:
+            return None
+        _, interval_s = message_indices(self.trace, self.options.interval_s)
+        return Service(interval_s, self.options.survival_s)
+
+    @cached_property
+    def _messages(self) -> tuple[LossBursts, Flags]:
+        """The loss bursts of the service's messages, and which of them are in an outage."""
+        chosen, _ = message_indices(self.trace, self.options.interval_s)
+        bursts = loss_bursts(self.outcomes.effective[chosen])
+        return bursts, self.in_outage[chosen][bursts.first] if len(bursts.first) else np.zeros(0, bool)
+
+    @property
+    def observed_availability(self) -> ObservedAvailability:
+        """The availability of the service in the trace, outages included."""
+        assert self.service is not None
+        return observed_availability(self._messages[0], self.service)
+
+    @cached_property
+    def availability_model(self) -> ChainFit | None:
+        """The preferred loss model of the service's messages, without outages; None without losses."""
+        bursts, left_out = self._messages
+        fits = ChainFits(bursts, left_out)
+        return fits.chosen if fits.lost else None
+
+    @property
+    def predicted_availability(self) -> ChainAvailability | None:
+        """The availability of the service by this model, without outages; None without losses."""
+        assert self.service is not None
+        fit = self.availability_model
+        return None if fit is None else chain_availability(fit.rates, self.service)
+
     def longer_bursts(self, cap: int) -> int:
         """Return the number of loss bursts of more than ``cap`` packets, without the outages."""
         return int(np.count_nonzero(self.bursts.length[~self.is_outage] > cap))
@@ -400,6 +450,9 @@ class NetworkMeasurement:
                 zip(map(str, self.delays.correlation.lags), self.delays.correlation.at_lags, strict=True)
             ),
             "jitter_s": None if self.delays.jitter is None else self.delays.jitter._asdict(),
+            "availability": None
+            if self.service is None
+            else to_json(self.service, self.observed_availability, self.predicted_availability),
             "interval_level": LEVEL,
             "models": {name: model.to_json() for name, model in self.models.items()},
             "chosen_model": self.chosen.fit.model if self.models else None,

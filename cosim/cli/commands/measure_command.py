@@ -46,6 +46,10 @@ class ClockRelation(StrEnum):
             "noack measure rural_n8_10kmh --for lane_following",
             "when its certificate is void",
         ),
+        (
+            "noack measure urban_n78_40kmh --deadline 100ms --survival 120ms",
+            "availability for a survival time",
+        ),
         ("noack measure sent.json", "round trips that `irtt client -o sent.json` has measured"),
         ("noack measure sender.pcap receiver.pcap", "captures of both ends"),
         (
@@ -119,6 +123,17 @@ def measure(
         str,
         Option(metavar="N|TIME", help="Chance of a long loss burst within N packets, or within a time."),
     ] = "1000",
+    interval: Annotated[
+        str | None,
+        Option(metavar="TIME", help="Transfer interval of a service; by default the packets' period."),
+    ] = None,
+    survival: Annotated[
+        str | None,
+        Option(
+            metavar="TIME",
+            help="Availability of a service that goes on for TIME after a lost message (survival time).",
+        ),
+    ] = None,
     for_scenario: Annotated[
         str | None,
         Option(
@@ -165,6 +180,8 @@ def measure(
         tuple(map(_share, share or ())) or QUANTILES,
         window or WINDOWS,
         _time_s("--outage", outage),
+        _time_s("--interval", interval),
+        _time_s("--survival", survival),
         within,
     )
     if settings and for_scenario is None:

@@ -116,3 +116,31 @@ def test_the_chance_of_a_long_burst_is_that_of_the_fitted_chain(chain_csv: Path)
     period_s = document["observed_s"] / (document["packets"] - 1)
     of_time = json.loads(measure(chain_csv, "--within", f"{500 * period_s:.6f}s", "--json").stdout)
     assert of_time["bursts_by_preferred_model"] == predicted
+
+
+def test_availability_is_printed_for_a_transfer_interval_and_a_survival_time() -> None:
+    words = ("urban_n78_40kmh", "--deadline", "100ms", "--survival", "120ms")
+    document = json.loads(measure(*words, "--json").stdout)["availability"]
+    assert (document["losses_survived"], document["messages"], document["failures"]) == (2, 3174, 2)
+    assert document["availability"]["low"] < document["availability"]["value"] < 1
+    assert 0.998 < document["by_preferred_model"]["availability"] < 1
+    text = " ".join(measure(*words).output.split())
+    assert "99.906 %" in text
+    assert "mean time between failures" in text
+    thinned = (
+        "urban_n78_40kmh",
+        "--deadline",
+        "100ms",
+        "--interval",
+        "180ms",
+        "--survival",
+        "180ms",
+        "--json",
+    )
+    document = json.loads(measure(*thinned).stdout)["availability"]
+    assert (document["transfer_interval_s"], document["losses_survived"]) == (0.18, 1)
+    assert document["messages"] == pytest.approx(189.3 / 0.18, abs=3)
+    assert json.loads(measure("urban_n78_40kmh", "--json").stdout)["availability"] is None
+    refused = measure("urban_n78_40kmh", "--interval", "10ms", "--survival", "30ms")
+    assert refused.exit_code == 2
+    assert "shorter than the time between two packets of the trace" in refused.output
