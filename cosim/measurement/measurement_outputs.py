@@ -32,6 +32,7 @@ from netem.core.number_format import (
 from netem.impairments.burst_prediction import chance_text
 from netem.measurement.interval_estimates import LEVEL, IntervalEstimate
 from netem.measurement.loss_bursts import histogram, most_losses
+from netem.measurement.measured_preset import write_preset
 from netem.measurement.network_measurement import NetworkMeasurement
 from noack.scenario.scenario import Scenario
 
@@ -50,6 +51,7 @@ class OutputRequest:
     form: Form = "trace"
     scenario: Scenario | None = None
     """A scenario whose certificates are compared with the network."""
+    preset: Path | None = None
 
     def __post_init__(self) -> None:
         """Refuse wrong names before anything is measured."""
@@ -77,6 +79,8 @@ def write_outputs(measurement: NetworkMeasurement, request: OutputRequest) -> tu
         written += save_page(document, request.page, request.figure_files)
     if request.network is not None:
         written += write_network(measurement, request.network, request.form)
+    if request.preset is not None:
+        written.append(write_preset(measurement, request.preset))
     return document, written
 
 

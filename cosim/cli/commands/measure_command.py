@@ -52,6 +52,7 @@ class ClockRelation(StrEnum):
         ),
         ("noack measure sent.json", "round trips that `irtt client -o sent.json` has measured"),
         ("noack measure sender.pcap receiver.pcap", "captures of both ends"),
+        ("noack measure capture.pcap --preset office", "for noack netem ... like ./office.toml"),
         (
             "noack measure rural_n8_10kmh --write network.toml",
             "the network for a scenario file",
@@ -156,6 +157,10 @@ def measure(
             help="Write a [network] section that reproduces the network (.toml).",
         ),
     ] = None,
+    preset: Annotated[
+        str | None,
+        Option(metavar="NAME", help="Write a preset, NAME.toml, for `noack netem ... like ./NAME.toml`."),
+    ] = None,
     form: Annotated[
         NetworkForm,
         Option("--as", help="Write the network as the trace itself, or as a fitted model."),
@@ -171,6 +176,7 @@ def measure(
     from cosim.measurement.measurement_outputs import OutputRequest, write_outputs
     from cosim.measurement.run_trace import read_source
     from netem.measurement.loss_bursts import WINDOWS
+    from netem.measurement.measured_preset import preset_path
     from netem.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
     from netem.measurement.trace_sources import SourceOptions
     from netem.traces.packet_trace import find_trace
@@ -189,7 +195,9 @@ def measure(
     scenario = None if for_scenario is None else opt.load_scenario(for_scenario, settings)
     if form is NetworkForm.MODEL and write is None:
         raise CallerError("--as model: is the form of --write; give its FILE.toml")
-    request = OutputRequest(out, requested_files(figure_format, width), write, form.value, scenario)
+    preset_file = None if preset is None else preset_path(preset)
+    figures = requested_files(figure_format, width)
+    request = OutputRequest(out, figures, write, form.value, scenario, preset_file)
     differ = None if clocks is None else clocks is ClockRelation.DIFFERENT
     reading = SourceOptions(differ, flow, far_flow, sequence_at, bits, numbers, _period_ns(rate))
     trace = read_source([*map(find_trace, sources)], reading)

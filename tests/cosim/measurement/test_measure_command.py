@@ -10,6 +10,8 @@ import noack
 from cosim.measurement.network_section import trace_csv
 from netem.core import toml_file
 from netem.measurement.chain_fits import ChainRates
+from netem.presets.preset import load_preset
+from netem.tc_words import settings_of
 from noack.scenario.sections import NetworkSection
 from tests.helpers.command_line import invoke
 from tests.netem.measurement.chains import chain_losses, trace_of
@@ -144,3 +146,33 @@ def test_availability_is_printed_for_a_transfer_interval_and_a_survival_time() -
     refused = measure("urban_n78_40kmh", "--interval", "10ms", "--survival", "30ms")
     assert refused.exit_code == 2
     assert "shorter than the time between two packets of the trace" in refused.output
+
+
+def test_a_measured_preset_is_a_network_of_the_emulator(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chain_csv: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    document = json.loads(measure(chain_csv, "--preset", "office", "--json").stdout)
+    assert document["written"] == ["office.toml"]
+    preset = load_preset(Path("office.toml"))
+    assert preset.source is not None
+    assert preset.source.title == str(chain_csv)
+    chain, delay = settings_of("like ./office.toml").impairments
+    assert chain.loss.transitions == pytest.approx((0.05, 0.5), rel=0.2)  # type: ignore[union-attr]
+    assert delay.delay_s == 0.001  # type: ignore[union-attr]
+    explained = invoke("netem", "--explain", "like", "./office.toml", "mansd", "4")
+    assert explained.exit_code == 0
+    assert "like office: Measured:" in " ".join(explained.output.split())
+    # A shipped preset is what the command writes, but for its name and its texts.
+    (tmp_path / "presets").mkdir()
+    assert measure(RURAL, "--deadline", "100ms", "--preset", "presets/mine.toml").exit_code == 0
+    shipped = settings_of("like 5g-rural")
+    assert settings_of("like presets/mine.toml") == shipped
+    refused = measure(RURAL, "--preset", "my office")
+    assert (refused.exit_code, "--preset my office: a preset's name has letters" in refused.output) == (
+        2,
+        True,
+    )
+    Path("none.csv").write_text("sent_ms,received_ms\n0,0\n5,5\n")
+    nothing = measure("none.csv", "--preset", "none")
+    assert "neither losses nor delays" in nothing.output
