@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from cosim.api.scenarios import Source, load
 from cosim.output import curves
 from cosim.output.curves import Curve
-from cosim.output.document import Sentence
 from cosim.output.run_verdict import verdict_of_exact_run
 from cosim.simulation import continuous
 from netem.core.number_checks import whole_number
+from netem.output.document import Sentence
 from noack.core.linear_systems import Matrix, Vector
 from noack.scenario.resolution import policy_of, resolve
 from noack.scenario.scenario import Scenario

@@ -21,14 +21,14 @@ from cosim.api.scenarios import Source, load
 from cosim.live import finalize as run_end
 from cosim.live.monitoring.run_observers import RunObserver
 from cosim.live.monitoring.run_terminal import RunTerminal
-from cosim.output import result_tables, run_tables, run_verdict
+from cosim.output import run_tables, run_verdict
 from cosim.output.curves import Curve
-from cosim.output.document import Sentence
 from cosim.output.export.export_formats import export_run
 from cosim.output.figures.figure_format import requested_files
 from cosim.output.figures.network_figures import page_figures
 from cosim.output.figures.page_figure import PageFigure
 from cosim.output.figures.run_figures import BOUNDED, run_curves
+from cosim.output.table_files import save_tables as save_result_tables
 from cosim.record import data_frames
 from cosim.record.run_directory import RECORD, REPORT_FILE, chosen_run, file_of_loop, require_run_directory
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, no_such_loop
@@ -37,6 +37,7 @@ from cosim.simulation.virtual_time import simulate_run
 from cosim.studies.run_comparison import RunComparison, compare_runs
 from netem.core.errors import CallerError, ExitStatus
 from netem.core.number_format import as_html, as_text
+from netem.output.document import Sentence
 from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.scenario import Scenario
 
@@ -256,7 +257,7 @@ class Run:
             NoackError: a file cannot be written.
         """
         tables = run_tables.summary_tables(self.summary)
-        return result_tables.save_tables(tables, Path(folder))
+        return save_result_tables(tables, Path(folder))
 
     def report(self) -> Path:
         """Write ``report.html``, a page with all figures, into the run directory; return its path.

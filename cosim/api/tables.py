@@ -10,10 +10,10 @@ from cosim.analysis.mean_cost import MeanCost
 from cosim.api.campaigns import CampaignResult
 from cosim.api.runs import Run
 from cosim.output import certificate_report
-from cosim.output.result_tables import ResultTable
-from cosim.output.result_tables import save_tables as save_result_tables
+from cosim.output.table_files import save_tables as save_result_tables
 from cosim.studies.campaign.campaign_report import campaign_tables
 from netem.core.errors import CallerError
+from netem.output.result_tables import ResultTable
 
 Result = Run | Certificates | MarginResult | MeanCost | CampaignResult
 

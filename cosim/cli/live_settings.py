@@ -4,9 +4,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from cosim.output.result_tables import ResultTable
-from cosim.output.terminal_writer import terminal_table
 from netem.core.errors import CallerError
+from netem.output.result_tables import ResultTable
+from netem.output.terminal_writer import terminal_table
 from noack.runtime.control_messages import ChangeReply
 from noack.scenario.runtime_parameters import SHORT, full_key, text_of
 from noack.scenario.scenario_file import value_of

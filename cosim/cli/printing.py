@@ -11,9 +11,9 @@ from netem.core.command_line import print_to_stderr
 from netem.core.errors import ExitStatus
 
 if TYPE_CHECKING:
-    from cosim.output.document import Document
-    from cosim.output.result_tables import ResultTable
     from netem.core.console import SafeConsole
+    from netem.output.document import Document
+    from netem.output.result_tables import ResultTable
 
 
 def console() -> "SafeConsole":
@@ -35,7 +35,7 @@ def show(document: "Document", *, json: bool, tables: Path | None = None, **adde
     if json:
         print_json({**document.data, **added})
     else:
-        from cosim.output.terminal_writer import print_document
+        from netem.output.terminal_writer import print_document
 
         print_document(console(), document)
     write_tables(document.tables, tables, json=json)
@@ -50,7 +50,7 @@ def show_written(document: "Document", files: Sequence[Path], *, json: bool) -> 
 
 def write_tables(tables: "Iterable[ResultTable]", folder: Path | None, *, json: bool) -> None:
     """Write the tables of ``--tables``, if it is given; print the paths, unless with ``--json``."""
-    from cosim.output.result_tables import save_tables
+    from cosim.output.table_files import save_tables
 
     if folder is not None:
         paths = save_tables(tables, folder)

@@ -12,8 +12,8 @@ from cosim.cli.printing import console as standard_console
 from cosim.cli.printing import print_json
 from cosim.live.launcher import DEFAULT_START_S
 from cosim.output.run_document import assumption_table
-from cosim.output.terminal_writer import terminal_table
 from netem.core.clock import NS_PER_S
+from netem.output.terminal_writer import terminal_table
 from noack.scenario.resolution import ResolvedRun, policy_of, resolve
 from noack.scenario.scenario import Scenario, loop_names
 from noack.scenario.scenario_file import dumps

@@ -9,9 +9,9 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from cosim.doctor.machine_measures import MachineFacts, RunRequirements
-from cosim.output.document import Block, Document, Sentence
-from cosim.output.result_tables import ResultTable, Tone
 from netem.core.number_format import byte_size, duration
+from netem.output.document import Block, Document, Sentence
+from netem.output.result_tables import ResultTable, Tone
 
 LOOP_PROCESSES = 5
 """Processes of a run, the recorder included."""

@@ -11,13 +11,11 @@ from cosim.live.monitoring.progress import activity
 from cosim.measurement.certificate_time import CertificateTime, measured_certificate_time
 from cosim.measurement.network_section import Form, write_network
 from cosim.output.curves import DASHED
-from cosim.output.document import Document, Sentence, SentenceRole
 from cosim.output.figures import palette
 from cosim.output.figures.axes_parts import draw_bars, draw_line, limit_to, rgb, set_times, whole_numbers
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.figures.palette import Colour
-from cosim.output.result_tables import KEY_VALUE, ResultTable
 from netem.core.errors import CallerError
 from netem.core.file_access import require_suffix
 from netem.core.number_format import (
@@ -34,6 +32,8 @@ from netem.measurement.interval_estimates import LEVEL, IntervalEstimate
 from netem.measurement.loss_bursts import histogram, most_losses
 from netem.measurement.measured_preset import write_preset
 from netem.measurement.network_measurement import NetworkMeasurement
+from netem.output.document import Document, Sentence, SentenceRole
+from netem.output.result_tables import KEY_VALUE, ResultTable
 from noack.scenario.scenario import Scenario
 
 if TYPE_CHECKING:

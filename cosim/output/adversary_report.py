@@ -4,10 +4,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from cosim.analysis.adversary import Objective, WorstRun
 from cosim.analysis.adversary.worst_disturbances import disturbance_bounds
-from cosim.output.document import Block, Document, Sentence, SentenceRole
-from cosim.output.result_tables import ResultTable, Tone
 from netem.core.clock import NS_PER_S
 from netem.core.number_format import NONE, at_least, at_most, counted, duration, number
+from netem.output.document import Block, Document, Sentence, SentenceRole
+from netem.output.result_tables import ResultTable, Tone
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import network_delay_ns

@@ -12,13 +12,13 @@ from cosim.analysis.certificates import IDEAL, SCHEDULE, Certificates, state_nor
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.analysis.tried_settings import MOST_S, TriedSettings
-from cosim.output.document import Block, Document, Sentence, SentenceRole
 from cosim.output.guarantee_sentence import although_lost, guarantee_sentence, is_within_allowed
-from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
 from cosim.simulation.sampled_loop import SampledLoop
 from netem.core.errors import CallerError
 from netem.core.number_format import at_least, at_most, duration_at_least, number
+from netem.output.document import Block, Document, Sentence, SentenceRole
+from netem.output.result_tables import ResultTable, Tone
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus, other_sign, paper_assumptions

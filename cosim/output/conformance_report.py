@@ -3,8 +3,8 @@
 from cosim.analysis.conformance.verdicts import Conformance
 from cosim.analysis.summary.summary_model import ConformancePart
 from cosim.output.conformance_words import conformance_text, failure_text
-from cosim.output.document import Document, Sentence, SentenceRole
-from cosim.output.result_tables import ResultTable, Tone
+from netem.output.document import Document, Sentence, SentenceRole
+from netem.output.result_tables import ResultTable, Tone
 
 
 def conformance_document(found: Conformance, name: str) -> Document:

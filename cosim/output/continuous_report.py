@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from cosim.output.document import Document, Sentence, SentenceRole
-from cosim.output.result_tables import KEY_VALUE, ResultTable, Tone
 from cosim.output.run_tables import burst_row, interval_rows, lost_row, title_of
 from cosim.output.run_verdict import verdict_of_exact_run
 from cosim.simulation import continuous
 from cosim.simulation.continuous import ContinuousRun
 from netem.core.number_format import number
+from netem.output.document import Document, Sentence, SentenceRole
+from netem.output.result_tables import KEY_VALUE, ResultTable, Tone
 from noack.scenario.scenario import Scenario
 
 _EVENTS_SHOWN = 40

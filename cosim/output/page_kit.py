@@ -11,12 +11,12 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from cosim.output.document import Document, Sentence, SentenceRole
 from cosim.output.figures.figure_files import inline, save_figures
 from cosim.output.figures.figure_format import PHONE_IN, SCREEN_IN, FigureFiles
-from cosim.output.figures.page_figure import PageFigure
-from cosim.output.result_tables import Tone
+from cosim.output.figures.page_figure import PageFigure, figures_of
 from cosim.record.run_directory import write_output
+from netem.output.document import Document, Sentence, SentenceRole
+from netem.output.result_tables import Tone
 
 PAGES = Path(__file__).with_name("pages")
 TERMS: tuple[tuple[str, str], ...] = tuple(
@@ -61,7 +61,7 @@ def save_page(document: Document, path: Path, files: FigureFiles | None = None) 
         MachineError: a file cannot be written.
     """
     return [
-        write_output(path, document_page(document)), *save_figures(document.figures, path, files),
+        write_output(path, document_page(document)), *save_figures(figures_of(document), path, files),
     ]  # fmt: skip
 
 

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 
 from cosim.analysis.replay.replay_result import ReplayResult
 from cosim.analysis.summary.summary_model import ReplayDifference
-from cosim.output.document import Block, Document, Sentence
-from cosim.output.result_tables import ResultTable, Tone
+from netem.output.document import Block, Document, Sentence
+from netem.output.result_tables import ResultTable, Tone
 
 _DIFFERENT = "≠"
 

@@ -17,12 +17,10 @@ from cosim.analysis.summary.loops_over_time import LoopOverTime
 from cosim.analysis.summary.run_summary import worst_loop
 from cosim.analysis.summary.summary_model import LoopSummary, RunSummary
 from cosim.output.conformance_words import conformance_text
-from cosim.output.document import Block, Document, Folded, Heading, Sentence
 from cosim.output.figures.network_figures import network_figures
 from cosim.output.figures.page_figure import PageFigure
 from cosim.output.figures.run_figures import envelopes, run_figures
 from cosim.output.page_kit import TERMS, document_page, value_text, words
-from cosim.output.result_tables import KEY_VALUE, ResultTable
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
     badness,
@@ -49,6 +47,8 @@ from cosim.record.run_record import RecordedRun
 from netem.core.errors import CallerError
 from netem.core.file_access import write_whole
 from netem.core.number_format import seconds
+from netem.output.document import Block, Document, Folded, Heading, Sentence
+from netem.output.result_tables import KEY_VALUE, ResultTable
 from noack.scenario.scenario import Scenario
 
 PROCESS_FIGURES = ("lateness", "latency", "clocks")

@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from cosim.analysis.certificates import Certificates
 from cosim.analysis.summary.summary_model import LoopSummary, RunSummary
 from cosim.output.requirement import Requirement
-from cosim.output.result_tables import Tone
 from cosim.output.run_verdict import guarantee_of, is_covered, state_of
 from cosim.simulation.continuous import ContinuousSummary
 from netem.core.errors import CallerError, NoackError
+from netem.output.result_tables import Tone
 
 
 @contextmanager

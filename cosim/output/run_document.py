@@ -15,8 +15,6 @@ from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import ClaimVerdict, LoopSummary, RunSummary
 from cosim.output.claim_words import claim_reason
 from cosim.output.conformance_words import conformance_text
-from cosim.output.document import Block, Document, Sentence, SentenceRole
-from cosim.output.result_tables import KEY_VALUE, ResultTable, Tone
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
     badness,
@@ -30,6 +28,8 @@ from cosim.output.run_tables import (
 from cosim.output.run_verdict import remarks, verdict
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE, file_of_loop
 from netem.core.number_format import counted
+from netem.output.document import Block, Document, Sentence, SentenceRole
+from netem.output.result_tables import KEY_VALUE, ResultTable, Tone
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 
 _ASSUMPTION_TONES: dict[str, Tone] = {

@@ -24,9 +24,9 @@ from cosim.analysis.summary.summary_model import (
     WatchdogPart,
 )
 from cosim.output.claim_words import claim_reason
-from cosim.output.result_tables import KEY_VALUE, ResultTable, Tone
 from netem.core.errors import ExitStatus
 from netem.core.number_format import NONE, counted, duration, duration_at_least, number, ratio, seconds, whole
+from netem.output.result_tables import KEY_VALUE, ResultTable, Tone
 from netem.tc_words import settings_of
 from noack.scenario.runtime_parameters import MANSD
 

@@ -21,12 +21,12 @@ from cosim.analysis.summary.summary_model import (
     RunSummary,
 )
 from cosim.output.claim_words import claim_reason
-from cosim.output.document import Sentence, SentenceRole
-from cosim.output.result_tables import Tone
 from cosim.output.run_tables import changes_in, shares_network, state_norm
 from cosim.simulation.continuous import ContinuousSummary
 from netem.core.errors import ExitStatus
 from netem.core.number_format import at_most, counted, duration_at_least, number, percent
+from netem.output.document import Sentence, SentenceRole
+from netem.output.result_tables import Tone
 from noack.protocol.wire_format import Rejection
 from noack.runtime.counting_sockets import DROPPED_IN_FLOOD
 from noack.runtime.end_reasons import HORIZON

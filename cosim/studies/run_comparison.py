@@ -12,7 +12,6 @@ import numpy as np
 
 from cosim.analysis.summary.summary_model import IdealLoopPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
-from cosim.output.document import Block, Document, Sentence
 from cosim.output.figures import palette
 from cosim.output.figures.axes_parts import (
     draw_line,
@@ -25,7 +24,6 @@ from cosim.output.figures.axes_parts import (
 )
 from cosim.output.figures.page_figure import PageFigure
 from cosim.output.figures.panels import Panels
-from cosim.output.result_tables import ResultTable
 from cosim.output.run_tables import caps_text
 from cosim.record.align import Reals, Times, align_tables
 from cosim.record.run_directory import chosen_run, require_output
@@ -34,6 +32,8 @@ from netem.core.clock import NS_PER_S
 from netem.core.errors import CallerError, shortened
 from netem.core.number_format import as_text
 from netem.core.row_operations import row_norms
+from netem.output.document import Block, Document, Sentence
+from netem.output.result_tables import ResultTable
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 
 if TYPE_CHECKING:

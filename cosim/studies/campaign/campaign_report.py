@@ -8,11 +8,10 @@ from typing import NamedTuple
 import tomli_w
 from pydantic_core import to_json
 
-from cosim.output.document import Block, Document, Folded, Heading, Sentence, SentenceRole
 from cosim.output.figures.figure_files import save_figures
 from cosim.output.figures.figure_format import FigureFiles
+from cosim.output.figures.page_figure import figures_of
 from cosim.output.page_kit import document_page
-from cosim.output.result_tables import ResultTable, Tone
 from cosim.record.run_directory import CAMPAIGN_PAGE, SUMMARY_FILE, read_object
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_file import MOST_DRAWS, Campaign
@@ -25,6 +24,8 @@ from netem.core.command_line import stop_requests_raised
 from netem.core.file_access import write_whole
 from netem.core.number_checks import whole_number
 from netem.core.number_format import plus_minus
+from netem.output.document import Block, Document, Folded, Heading, Sentence, SentenceRole
+from netem.output.result_tables import ResultTable, Tone
 from noack.core.progress import Progress, no_progress
 
 PAGE, SUMMARY = CAMPAIGN_PAGE, SUMMARY_FILE
@@ -63,7 +64,7 @@ def write_report(
         write_whole(store.folder / PAGE, document_page(document)),
         write_whole(store.folder / SUMMARY, content + b"\n"),
         store.folder / RUNS,
-        *save_figures(document.figures, store.folder / PAGE, figure_files),
+        *save_figures(figures_of(document), store.folder / PAGE, figure_files),
     ]
 
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosim.output.curves import DASHED
-from cosim.output.document import Block, Document, Folded, Heading, Sentence, SentenceRole
 from cosim.output.figures import palette
 from cosim.output.figures.axes_parts import MARKERS, draw_line, draw_points, label_text, rgb, series_colour
 from cosim.output.figures.page_figure import PageFigure, one_panel
-from cosim.output.result_tables import ResultTable, Tone
 from cosim.studies.design.design_outcome import HEIGHT_IN, DesignOutcome
 from cosim.studies.design.design_search import WORDS, DesignResult, certified
 from netem.core.number_format import plus_minus
+from netem.output.document import Block, Document, Folded, Heading, Sentence, SentenceRole
+from netem.output.result_tables import ResultTable, Tone
 from noack.scenario.scenario_file import dumps
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import pytest
 import noack
 from cosim.cli.options import load_scenario
 from cosim.cli.played_pattern import GROWN, until_it_shows
-from cosim.output.result_tables import Tone
+from netem.output.result_tables import Tone
 from tests.helpers.command_line import invoke
 
 pytestmark = pytest.mark.usefixtures("nothing_was_found_before")

@@ -14,7 +14,7 @@ from typer.testing import Result
 
 from cosim.doctor.findings import MachineFinding, MachineVerdict, find_all, findings_document, worst
 from cosim.doctor.machine_measures import Buffer, Disk, Lateness, MachineFacts, RunRequirements, lateness
-from cosim.output.terminal_writer import print_document
+from netem.output.terminal_writer import print_document
 from tests.helpers.command_line import invoke
 
 WANTED = RunRequirements(

@@ -15,10 +15,10 @@ from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.scenario_certificates import certificate_of, quick_certificate
 from cosim.analysis.witnesses import WitnessedStatement, find_statement
 from cosim.output.certificate_report import certificate_document, certificate_table
-from cosim.output.document import Sentence
-from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate
 from netem.core.errors import ExitStatus
+from netem.output.document import Sentence
+from netem.output.terminal_writer import print_document
 from noack.core.linear_systems import Vector
 from noack.proof.search.results import smallest_bounds
 from noack.theory.certificates.conditions import allowed_conditions, outside_box

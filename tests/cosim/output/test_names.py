@@ -11,8 +11,8 @@ from rich.console import Console
 
 import noack
 from cosim.output.run_document import run_document
-from cosim.output.terminal_writer import print_document
 from netem.core.errors import CallerError
+from netem.output.terminal_writer import print_document
 from tests.helpers.command_line import invoke
 from tests.helpers.named_scenario import NAMES, named_content
 

@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 
 import noack
-from cosim.output import result_tables
 from cosim.output.run_tables import summary_tables
+from cosim.output.table_files import save_tables
 from netem.core.errors import CallerError
+from netem.output import result_tables
 from tests.helpers.command_line import invoke
 
 
@@ -31,7 +32,7 @@ def test_units_move_to_the_heads() -> None:
 
 def test_tables_of_a_run_have_its_numbers(tmp_path: Path) -> None:
     simulated = noack.simulate(noack.load("lane_following", {"horizon_s": 4.0}))
-    result_tables.save_tables(summary_tables(simulated.summary), tmp_path)
+    save_tables(summary_tables(simulated.summary), tmp_path)
     numbers, (loop,) = dict(rows_of(tmp_path / "numbers.csv")), simulated.summary.loops
     assert numbers["transmissions"] == str(loop.events)
     assert float(numbers["shortest inter-event time [s]"]) == pytest.approx(loop.inter_event_min_s, abs=5e-4)

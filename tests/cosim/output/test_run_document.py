@@ -12,8 +12,8 @@ from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import finalize
 from cosim.output.run_document import run_document
-from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate_run
+from netem.output.terminal_writer import print_document
 from tests.helpers.shipped import shipped
 from tests.helpers.summaries import claim, with_values
 

@@ -12,9 +12,9 @@ from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import finalize
 from cosim.output import run_verdict
-from cosim.output.result_tables import Tone
 from cosim.output.run_verdict import remarks, state_text, verdict
 from cosim.simulation.virtual_time import simulate_run
+from netem.output.result_tables import Tone
 from noack.protocol.wire_format import Rejection
 from noack.runtime.counting_sockets import DROPPED_IN_FLOOD
 from tests.helpers.approved import compare_lines

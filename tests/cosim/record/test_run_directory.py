@@ -18,7 +18,7 @@ from cosim.analysis.summary.summary_model import read_summary
 from cosim.api.runs import open_run
 from cosim.output.export.export_formats import export_run
 from cosim.output.export.mat_export import save_mat
-from cosim.output.result_tables import ResultTable, save_tables
+from cosim.output.table_files import save_tables
 from cosim.record.run_directory import (
     CAMPAIGN_FILE,
     ENVIRONMENT_FILE,
@@ -41,6 +41,7 @@ from cosim.record.run_record import load_record
 from cosim.record.spool_conversion import finish_record
 from cosim.record.table_files import TableFile, write_table
 from netem.core.errors import CallerError
+from netem.output.result_tables import ResultTable
 from noack.protocol.record_tables import COMMON, LOOP, PLANT_STEP, TABLES, Column, Table
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 from tests.fuzz.parsers.record import NOTICE, files, spooled

@@ -21,7 +21,6 @@ from cosim.analysis.summary.summary_model import ExitPart, LoopSummary
 from cosim.live.finalize import reopen
 from cosim.live.recording.recorder import Recorder
 from cosim.output.run_document import run_document
-from cosim.output.terminal_writer import print_document
 from cosim.record.record_writing import write_run
 from cosim.record.rows import with_loop
 from cosim.record.run_directory import (
@@ -36,6 +35,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import Rows, RunRecord, load_record
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
+from netem.output.terminal_writer import print_document
 from noack.protocol.record_tables import OWNER
 from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, batch_of, notices_of
 from noack.scenario.resolution import ResolvedRun, resolve

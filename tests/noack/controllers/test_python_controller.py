@@ -13,11 +13,11 @@ from scipy.optimize import minimize
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.output_statistics import output_parts
-from cosim.output.result_tables import Tone
 from cosim.output.run_verdict import verdict
 from cosim.record.run_record import RunRecord, load_record
 from cosim.simulation.virtual_time import simulate, simulate_run
 from netem.core.errors import CallerError, ExitStatus
+from netem.output.result_tables import Tone
 from noack.controllers.controller_settings import ControlModel
 from noack.protocol.record_tables import CONTROLLER_STEP
 from noack.scenario.resolution import resolve

@@ -19,10 +19,10 @@ from cosim.output.page_kit import document_page
 from cosim.output.report_page import Report, report_document
 from cosim.output.run_document import run_document
 from cosim.output.run_tables import key_numbers
-from cosim.output.terminal_writer import print_document
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from netem.core.errors import ExitStatus
+from netem.output.terminal_writer import print_document
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.helpers.summaries import summary_of, with_values

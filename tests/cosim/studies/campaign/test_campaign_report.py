@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from cosim.output.result_tables import ResultTable
-from cosim.output.terminal_writer import without_constants
 from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import base_of, grid
 from cosim.studies.campaign.campaign_report import write_report
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.chunk_store import Store
+from netem.output.result_tables import ResultTable
+from netem.output.terminal_writer import without_constants
 from tests.cosim.studies.campaign.conftest import HOSTILE, Command, Write
 
 

@@ -6,13 +6,11 @@ A table is rows of text. Before it is written as CSV, the units of its values mo
 import csv
 import io
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from enum import StrEnum
-from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-from cosim.record.run_directory import require_folder, write_output
 from netem.core.number_format import NONE
 
 KEY_VALUE = ("quantity", "value")
@@ -71,19 +69,6 @@ class ResultTable(NamedTuple):
     def rows_on_terminal(self) -> list[Sequence[str]]:
         """The rows that a terminal shows."""
         return [row for i, row in enumerate(self.rows) if self.shown is None or i in self.shown]
-
-
-def save_tables(tables: Iterable[ResultTable], folder: Path) -> list[Path]:
-    """Write tables into a folder, each as ``NAME.csv``.
-
-    Returns:
-        The written files.
-
-    Raises:
-        MachineError: a file cannot be written.
-    """
-    require_folder(folder)
-    return [write_output(folder / f"{table.name}.csv", as_csv(table)) for table in tables]
 
 
 def as_csv(table: ResultTable) -> str:

@@ -8,8 +8,8 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from cosim.output.document import Document, Sentence, SentenceRole
-from cosim.output.result_tables import ResultTable, Tone
+from netem.output.document import Document, Sentence, SentenceRole
+from netem.output.result_tables import ResultTable, Tone
 
 _APART = 3
 """Largest distance between columns of a table that is split, margins included."""

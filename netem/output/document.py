@@ -1,16 +1,14 @@
 """What an analysis found: a document of sentences, tables and figures.
 
-Each analysis builds a :class:`Document`. :func:`cosim.output.terminal_writer.print_document` writes it
-on a terminal, :func:`cosim.output.page_kit.document_page` as a page; its JSON is ``data``, and
-:func:`cosim.output.result_tables.save_tables` writes its tables as CSV.
+Each analysis builds a :class:`Document`. :func:`netem.output.terminal_writer.print_document` writes it on a
+terminal; its JSON is ``data``. A page of noack shows its pictures, too.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from cosim.output.figures.page_figure import PageFigure
-from cosim.output.result_tables import ResultTable, Tone
+from netem.output.result_tables import ResultTable, Tone
 
 
 class SentenceRole(StrEnum):
@@ -53,7 +51,11 @@ class Folded:
     text: str
 
 
-Block = Sentence | ResultTable | PageFigure | Heading | Folded
+class Picture:
+    """What a page shows as a picture; a terminal leaves it out."""
+
+
+Block = Sentence | ResultTable | Picture | Heading | Folded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,11 +76,6 @@ class Document:
     def tables(self) -> list[ResultTable]:
         """The tables that have files: those with a name."""
         return [block for block in self.blocks if isinstance(block, ResultTable) and block.name]
-
-    @property
-    def figures(self) -> list[PageFigure]:
-        """The figures."""
-        return [block for block in self.blocks if isinstance(block, PageFigure)]
 
     @property
     def verdict(self) -> list[Sentence]:
