@@ -51,11 +51,11 @@ class Folded:
     text: str
 
 
-class Picture:
+class FigureBlock:
     """What a page shows as a picture; a terminal leaves it out."""
 
 
-Block = Sentence | ResultTable | Picture | Heading | Folded
+Block = Sentence | ResultTable | FigureBlock | Heading | Folded
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,11 +33,12 @@ LEFT_OUT = {
 """Tests of aioquic that do not run here, and why."""
 PROGRAM = f'''
 import contextlib
+import importlib
 import os
 
 from netem.lossy_udp import LossyUdp
-from tests.test_asyncio import HighLevelTest as Direct
 
+Direct = importlib.import_module("tests.test_asyncio").HighLevelTest
 SEED = int(os.environ["NOACK_SEED"])
 
 

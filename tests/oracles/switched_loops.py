@@ -7,7 +7,7 @@ from flint import arb_mat
 
 from noack.core.balls import matrix
 from noack.core.linear_systems import Matrix
-from noack.proof.search.growth import Burst, Guarantee, PeriodicLoop, TransmissionTimes
+from noack.proof.search.growth import Burst, GuaranteeAutomaton, PeriodicLoop, TransmissionTimes
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.witnesses.growth import enclose_growth
 
@@ -21,10 +21,10 @@ class SwitchedLoop(PeriodicLoop):
         period = 10**9
         self.times = TransmissionTimes(period, period, period // 2, period, 0, 0, None, False, 1)
         self.between = range(1, 2)
-        self.guarantee, self.size = Guarantee(0), len(self.matrices_of[0])
+        self.guarantee, self.size = GuaranteeAutomaton(0), len(self.matrices_of[0])
         self.bursts = [Burst(v, w, number, 0, 0, 1) for number, (v, w, _) in enumerate(edges)]
 
-    def under(self, guarantee: Guarantee) -> "SwitchedLoop":
+    def under(self, guarantee: GuaranteeAutomaton) -> "SwitchedLoop":
         """Return the same system."""
         return self
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from cosim.output.figures.axes_parts import mark_empty
 from cosim.output.figures.figure_format import SCREEN_IN
 from cosim.output.figures.panels import Panels, place
-from netem.output.document import Document, Picture
+from netem.output.document import Document, FigureBlock
 
 if TYPE_CHECKING:  # the command line needs no matplotlib
     from matplotlib.axes import Axes
@@ -29,7 +29,7 @@ _STYLES = Path(__file__).with_name("styles")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PageFigure(Picture):
+class PageFigure(FigureBlock):
     """A figure; it is drawn when it is used.
 
     >>> figure = one_panel("squares", 2.0, lambda axes: axes.plot([1, 2, 3], [1, 4, 9]))

@@ -29,7 +29,7 @@ _PARTS = 8
 _FEW_SEGMENTS = 200
 
 
-class ReferenceSegment(NamedTuple):
+class EnclosedSegment(NamedTuple):
     """Σ_k polynomial_k τ^k + Σ_l sines_l sin 2πf_l τ + cosines_l cos 2πf_l τ; τ is the time since its begin.
 
     The n states of x_r come first, then the m inputs of u_r.
@@ -53,14 +53,14 @@ class ReferenceSegment(NamedTuple):
             )
         return value
 
-    def image(self, M: arb_mat) -> "ReferenceSegment":
+    def image(self, M: arb_mat) -> "EnclosedSegment":
         """Return M times the values."""
-        return ReferenceSegment(self.begin, M * self.polynomial, self.hz, M * self.sines, M * self.cosines)
+        return EnclosedSegment(self.begin, M * self.polynomial, self.hz, M * self.sines, M * self.cosines)
 
-    def minus(self, other: "ReferenceSegment", rows: Sequence[int]) -> "ReferenceSegment":
+    def minus(self, other: "EnclosedSegment", rows: Sequence[int]) -> "EnclosedSegment":
         """Return the difference to some rows of a segment of the same powers and waves."""
         P, S, C = (rows_of(M, rows) for M in (other.polynomial, other.sines, other.cosines))
-        return ReferenceSegment(self.begin, self.polynomial - P, self.hz, self.sines - S, self.cosines - C)
+        return EnclosedSegment(self.begin, self.polynomial - P, self.hz, self.sines - S, self.cosines - C)
 
     @property
     def is_constant(self) -> bool:
@@ -68,7 +68,7 @@ class ReferenceSegment(NamedTuple):
         return self.polynomial.ncols() == 1 and not self.hz
 
     @property
-    def derivative(self) -> "ReferenceSegment":
+    def derivative(self) -> "EnclosedSegment":
         """The derivative, of as many powers."""
         P, width = self.polynomial, self.polynomial.nrows()
         powers = [k * columns_of(P, [k]) for k in range(1, P.ncols())] + [zeros(width, 1)]
@@ -83,7 +83,7 @@ class ReferenceSegment(NamedTuple):
         cosines = arb_mat(
             width, len(omega), [omega[k] * self.sines[i, k] for i in range(width) for k in waves]
         )
-        return ReferenceSegment(self.begin, whole, self.hz, sines, cosines)
+        return EnclosedSegment(self.begin, whole, self.hz, sines, cosines)
 
     def largest(self, length: arb, parts: int) -> list[arb]:
         """Return upper bounds of the absolute values up to a time since its begin."""
@@ -157,7 +157,7 @@ class Moments(NamedTuple):
     """Of the run."""
 
 
-def first_jump(segments: Sequence[ReferenceSegment], n: int, end: fmpq) -> fmpq:
+def first_jump(segments: Sequence[EnclosedSegment], n: int, end: fmpq) -> fmpq:
     """Return when x_r first jumps by more than rounding, or the end of the run."""
     largest = _largest_entry(segments[0].at(arb(0)))
     for before, after in pairwise(segments):
@@ -171,7 +171,7 @@ def first_jump(segments: Sequence[ReferenceSegment], n: int, end: fmpq) -> fmpq:
 
 
 def about_reference(
-    segments: Sequence[ReferenceSegment], loop: Matrices, times: Moments, error_gain: arb | None
+    segments: Sequence[EnclosedSegment], loop: Matrices, times: Moments, error_gain: arb | None
 ) -> About:
     """Return the loop about a reference, until it first jumps.
 
@@ -184,7 +184,7 @@ def about_reference(
     lengths = [arb(end - segment.begin) for segment, end in zip(used, ends, strict=True)]
     parts = _PARTS if len(used) <= _FEW_SEGMENTS else 1
 
-    def largest(of: Sequence[ReferenceSegment]) -> list[arb]:
+    def largest(of: Sequence[EnclosedSegment]) -> list[arb]:
         return _most([each.largest(length, parts) for each, length in zip(of, lengths, strict=True)])
 
     slopes = [segment.derivative for segment in used]
@@ -230,7 +230,7 @@ def about_reference(
 
 
 def _steps_together(
-    used: Sequence[ReferenceSegment], jumps: Sequence[arb_mat], n: int, m: int, within: fmpq
+    used: Sequence[EnclosedSegment], jumps: Sequence[arb_mat], n: int, m: int, within: fmpq
 ) -> list[arb]:
     """Return the largest sum of |jumps| of each entry of u_r within a time."""
     if not within > 0:
@@ -245,7 +245,7 @@ def _steps_together(
     return largest
 
 
-def _over(used: Sequence[ReferenceSegment], lengths: Sequence[arb], end: fmpq) -> arb_mat:
+def _over(used: Sequence[EnclosedSegment], lengths: Sequence[arb], end: fmpq) -> arb_mat:
     """Return balls that contain the values up to a time, or to the end of what is used."""
     whole: arb_mat | None = None
     for segment, length in zip(used, lengths, strict=True):
@@ -285,10 +285,10 @@ def _row_norm(M: arb_mat, row: int) -> arb:
     return frobenius(rows_of(M, [row]))
 
 
-def padded(segment: ReferenceSegment, n: int, zero_states: int) -> ReferenceSegment:
+def padded(segment: EnclosedSegment, n: int, zero_states: int) -> EnclosedSegment:
     """Return a segment with further states that are 0 after its n own ones."""
     P, S, C = (_with_zeros(M, n, zero_states) for M in (segment.polynomial, segment.sines, segment.cosines))
-    return ReferenceSegment(segment.begin, P, segment.hz, S, C)
+    return EnclosedSegment(segment.begin, P, segment.hz, S, C)
 
 
 def _with_zeros(M: arb_mat, n: int, zero_states: int) -> arb_mat:

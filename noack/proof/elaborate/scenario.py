@@ -28,7 +28,7 @@ from noack.proof.elaborate.errors import RefusedError, RejectedError
 from noack.proof.elaborate.keys import Table, refusals
 from noack.proof.elaborate.loop import Along, Loop, LoopObserver, Memory, Region, Rule, Times
 from noack.proof.elaborate.norms import lyapunov_function, spectral_norm
-from noack.proof.elaborate.reference import Matrices, Moments, ReferenceSegment, about_reference, padded
+from noack.proof.elaborate.reference import EnclosedSegment, Matrices, Moments, about_reference, padded
 from noack.proof.elaborate.tables import read_table
 from noack.proof.elaborate.times import NS_PER_S, ScenarioSchedule, fraction, nanoseconds, nearest_ns
 from noack_equations import LinearPlants, region_of
@@ -171,9 +171,9 @@ def _error_gain(loop: Loop) -> arb | None:
     return None if P is None else (spectral_norm(P) * spectral_norm(P.inv())).sqrt()
 
 
-def _segments(controller: Table, n: int, m: int) -> list[ReferenceSegment]:
+def _segments(controller: Table, n: int, m: int) -> list[EnclosedSegment]:
     """Return the segments of a reference of n states and m inputs."""
-    found: list[ReferenceSegment] = []
+    found: list[EnclosedSegment] = []
     for entry in _tables(controller, "controller.reference"):
         _choice(entry, "controller.reference.kind", ("segment",))
         hz = [number(f) for f in _row(entry, "controller.reference.hz")] if "hz" in entry else []
@@ -199,7 +199,7 @@ def _segments(controller: Table, n: int, m: int) -> list[ReferenceSegment]:
             _by_columns(x, u, n + m) for x, u in ((rows["x"], rows["u"]), waves["sines"], waves["cosines"])
         )
         polynomial, sines, cosines = sides
-        found.append(ReferenceSegment(begin, polynomial, hz, sines, cosines))
+        found.append(EnclosedSegment(begin, polynomial, hz, sines, cosines))
     if not found:
         raise RefusedError("controller.reference: no segment")
     return found

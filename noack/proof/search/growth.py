@@ -68,7 +68,7 @@ State = tuple[int, tuple[int, ...], tuple[int, ...]]
 """Losses in a row, the outcomes of each window as bits, deliveries since the last loss."""
 
 
-class Guarantee(NamedTuple):
+class GuaranteeAutomaton(NamedTuple):
     """Which outcomes of successive updates are allowed."""
 
     losses: int  # most consecutive losses
@@ -179,7 +179,7 @@ class Burst(NamedTuple):
     """How long after the first transmission an update arrives; None: nominally."""
 
 
-def list_bursts(guarantee: Guarantee, times: TransmissionTimes, between: range) -> list[Burst]:
+def list_bursts(guarantee: GuaranteeAutomaton, times: TransmissionTimes, between: range) -> list[Burst]:
     """Return all bursts; node 0 is that of the first transmission.
 
     Of several with the same nodes and units, the one with the fewest losses stands for all.
@@ -274,7 +274,7 @@ class PeriodicLoop:
         matrices: tuple[arb_mat, arb_mat, arb_mat, arb_mat],
         times: TransmissionTimes,
         between: range,
-        guarantee: Guarantee,
+        guarantee: GuaranteeAutomaton,
     ) -> None:
         self.matrices, self.times = matrices, times
         self.between, self.guarantee = between, guarantee
@@ -308,7 +308,7 @@ class PeriodicLoop:
         self._after: dict[tuple[int, int, int], list[arb_mat]] = {}
         self._matrices: dict[tuple[int, int, int, int], arb_mat] = {}
 
-    def under(self, guarantee: Guarantee) -> "PeriodicLoop":
+    def under(self, guarantee: GuaranteeAutomaton) -> "PeriodicLoop":
         """Return the same loop with another guarantee."""
         other = PeriodicLoop.__new__(type(self))
         other.__dict__.update(self.__dict__)
@@ -462,7 +462,7 @@ def read_periodic_loop(resolved: Table, longest: int | None = None) -> PeriodicL
         raise RefusedError("too many updates are on their way at once")
     between = range(least // measurements, most // measurements + 1)
     windows, recoveries = loss_rules(resolved)
-    guarantee = Guarantee(loop.losses, windows, recoveries)
+    guarantee = GuaranteeAutomaton(loop.losses, windows, recoveries)
     return PeriodicLoop((loop.A, loop.B, loop.gain, loop.H), times, between, guarantee)
 
 

@@ -24,7 +24,7 @@ from netem.guarantee.loss_guarantee import (
 )
 from noack.proof.elaborate.errors import RefusedError
 from noack.proof.loop_document import NoDocumentError
-from noack.proof.search.growth import Guarantee, PeriodicLoop, read_periodic_loop
+from noack.proof.search.growth import GuaranteeAutomaton, PeriodicLoop, read_periodic_loop
 from noack.scenario.arrival_ties import LATENCY_NS
 from noack.scenario.scenario import Scenario
 from noack.theory.time_triggered.scenario_times import intervals, require_covered, require_usable_updates
@@ -116,14 +116,14 @@ def capped(guarantee: LossGuarantee, losses: int) -> LossGuarantee:
     return LossGuarantee((LongestBurst(losses), *uncapped(guarantee).rules))
 
 
-def checked_guarantee(guarantee: LossGuarantee) -> Guarantee:
+def checked_guarantee(guarantee: LossGuarantee) -> GuaranteeAutomaton:
     """Return a guarantee as noack-check has it."""
     rules, longest = guarantee.rules, guarantee.longest_burst
     if longest is None:
         raise CallerError(f"{guarantee.meaning}: needs a maximum of losses")
     windows = ((rule.limit, rule.window) for rule in rules if isinstance(rule, LossesInWindow))
     recoveries = (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts))
-    return Guarantee(longest, tuple(windows), tuple(recoveries))
+    return GuaranteeAutomaton(longest, tuple(windows), tuple(recoveries))
 
 
 class LossMargin:
