@@ -81,8 +81,10 @@ typedef struct {
 typedef struct {
     int64_t head, count;
     int64_t entry_ns;
-    int64_t busy_until_ns; /* opportunities: time of the last opportunity that was used */
-    int64_t carry;         /* fraction of a nanosecond, in units of 1/rate_bps */
+    /* of a bottleneck: end of the last transmission; with a burst, when the bucket is empty.
+       Opportunities: time of the last opportunity that was used */
+    int64_t busy_until_ns;
+    int64_t carry; /* fraction of a nanosecond, in units of 1/rate_bps */
     /* CoDel: the variables of RFC 8289, Section 5 */
     int64_t first_above_ns, drop_next_ns;
     int64_t drops; /* count_ of the RFC */
@@ -96,7 +98,7 @@ typedef struct {
     int64_t state, step;
     /* of the packets that wait until the link is free, the place + 1; 0: none */
     int64_t first_waiting;
-    int64_t waiting_count;
+    int64_t waiting_count, waiting_bytes;
 } noack_stage_state;
 
 /* A stored datagram that waits until the link is free; see native/network/waiting.c. */
@@ -127,7 +129,7 @@ struct noack_link {
     int64_t *recent_ns;              /* (rows, recent_width) release times of the last packets */
     int64_t *losses;                 /* (rows, loss_width) numbers of losses so far, S */
     noack_stage_state *stage_states; /* (stage_count,) */
-    int64_t *departures_ns;          /* the rings of the queues */
+    int64_t *departures_ns;          /* the rings of the queues: two numbers for each packet */
     int64_t in_flight;               /* delayed packets and copies */
     noack_counters counters;
 };
@@ -214,11 +216,23 @@ static inline int64_t first_above(
 double latent(double correlation, double innovation, noack_stage_memory *memory, double u);
 int happens(const noack_chance *chance, noack_stage_memory *memory, double u);
 
-/* tail_drop.c: occupy a place in a bottleneck's queue. codel.c: whether its law drops the packet
-   that has just entered the queue, and drop it. */
-void queue_occupy(noack_link *link, int64_t stage, int64_t until_ns);
+/* tail_drop.c: the bytes that a packet needs on the line of a bottleneck; the bytes that are in a
+   queue at now_ns, from which what has left until then is removed; occupy a place in the queue. */
+int64_t line_bytes_of(const noack_bottleneck *settings, int64_t size_bytes);
+int64_t queue_bytes_at(noack_link *link, int64_t stage, int64_t now_ns);
+void queue_occupy(noack_link *link, int64_t stage, int64_t until_ns, int64_t bytes);
+/* In a queue each packet counts a byte at least, so that the number of packets is limited, too. */
+static inline int64_t queued_bytes(int64_t line_bytes) { return max_of(line_bytes, 1); }
+/* Whether the bytes that a bottleneck's queue may have leave room for a packet. */
+static inline int fits_queue(
+    const noack_bottleneck *settings, int64_t waiting_bytes, int64_t line_bytes) {
+    return settings->queue_bytes == 0
+           || waiting_bytes + queued_bytes(line_bytes) <= settings->queue_bytes;
+}
+
+/* codel.c: whether its law drops the packet that has just entered the queue, and drop it. */
 int codel_is_due(const noack_link *link, int64_t stage);
-void codel_drop(noack_link *link, int64_t stage);
+void codel_drop(noack_link *link, int64_t stage, int64_t bytes);
 
 /* loop/process.c: let the processor fetch the memory of a machine, which is needed soon. Without it
    the step of one of a thousand loops waits for it. */

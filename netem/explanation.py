@@ -97,6 +97,7 @@ def _document(settings: LinkSettings, packets: int) -> dict[str, object]:
         "predicted_mean_burst": _mean_burst(settings),
         "order": order_meaning(settings),
         "tc": tc.words,
+        "tc_behind": tc.behind,
         "tc_lacks": list(tc.lacks),
         "tc_notes": list(tc.notes),
     }
@@ -272,11 +273,23 @@ class TcCommand(NamedTuple):
     """The nearest settings that ``tc`` supports."""
 
     words: str | None
-    """After ``tc qdisc add dev DEVICE root netem``; None if tc supports none of the settings."""
+    """After ``tc qdisc add dev DEVICE root netem``; None if its netem supports none of the settings."""
+    behind: str | None
+    """Another qdisc of tc, behind netem or alone: its words."""
     lacks: tuple[str, ...]
     """The words that are left out, each with the missing tc feature."""
     notes: tuple[str, ...]
     """Differences in behaviour."""
+
+    @property
+    def commands(self) -> Sequence[str]:
+        """The commands, for a network device; none if tc supports none of the settings."""
+        add = "tc qdisc add dev DEVICE"
+        if self.words is not None and self.behind is not None:
+            return f"{add} root handle 1: netem {self.words}", f"{add} parent 1:1 handle 2: {self.behind}"
+        if self.behind is not None:
+            return (f"{add} root {self.behind}",)
+        return () if self.words is None else (f"{add} root netem {self.words}",)
 
 
 def tc_command(settings: LinkSettings, written: LinkSettings | None = None) -> TcCommand:
@@ -306,8 +319,10 @@ def tc_command(settings: LinkSettings, written: LinkSettings | None = None) -> T
     if settings.first_delivered:
         lacks.append("first (that the first packet of each flow is delivered)")
     if expressible and not supported:
-        return TcCommand(None, tuple(lacks), ())
-    text = " ".join([f"limit {settings.limit}", *(impairment.tc_text() for impairment in supported)])
+        return TcCommand(None, None, tuple(lacks), ())
+    by_netem = [impairment.tc_text() for impairment in supported if not impairment.tc_qdisc()]
+    behind = next((impairment.tc_qdisc() for impairment in supported if impairment.tc_qdisc()), None)
+    text = " ".join([f"limit {settings.limit}", *by_netem]) if by_netem or behind is None else None
     notes = [note for impairment in supported for note in impairment.tc_notes()]
     kinds = [impairment.kind for impairment in supported]
     order = [_FIXED_ORDER.index(kind) for kind in kinds if kind in _FIXED_ORDER]
@@ -315,24 +330,26 @@ def tc_command(settings: LinkSettings, written: LinkSettings | None = None) -> T
         notes.append(f"its order is fixed: {', '.join(_FIXED_ORDER)}")
     if "duplicate" in kinds and "loss" in kinds:
         notes.append("a packet that it duplicates is never lost: a loss takes only one of the two copies")
-    return TcCommand(text, tuple(lacks), tuple(dict.fromkeys(notes)))
+    return TcCommand(text, behind, tuple(lacks), tuple(dict.fromkeys(notes)))
 
 
 def _print_tc(console: Console, tc: TcCommand) -> None:
     lacks = ", ".join(tc.lacks)
-    if tc.words is None:
+    if not tc.commands:
         console.print(Text(f"not possible with tc, which lacks: {lacks}"))
         return
-    console.print(Text("nearest command of tc, for a network device:"))
-    command = textwrap.wrap(
-        f"tc qdisc add dev DEVICE root netem {tc.words}",
-        max(console.width - 2, _NARROW_WIDTH),
-        initial_indent="  ",
-        subsequent_indent="      ",
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    console.print(Text(" \\\n".join(command)), soft_wrap=True)
+    plural = "s" if len(tc.commands) > 1 else ""
+    console.print(Text(f"nearest command{plural} of tc, for a network device:"))
+    for command in tc.commands:
+        lines = textwrap.wrap(
+            command,
+            max(console.width - 2, _NARROW_WIDTH),
+            initial_indent="  ",
+            subsequent_indent="      ",
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        console.print(Text(" \\\n".join(lines)), soft_wrap=True)
     if lacks:
         console.print(Text(f"tc lacks: {lacks}"))
     for note in tc.notes:

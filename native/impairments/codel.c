@@ -18,7 +18,8 @@
 
 #include "../core.h"
 
-/* The time at which the service of a newly arrived packet would begin. */
+/* The time at which the service of a newly arrived packet would begin: with a burst, the time from
+   which the rate fills the bucket for it, or its arrival. */
 static int64_t service_ns(const noack_stage_state *queue) {
     return max_of(queue->entry_ns, queue->busy_until_ns);
 }
@@ -53,11 +54,11 @@ int codel_is_due(const noack_link *link, int64_t stage) {
 }
 
 /* Drop the newly arrived packet: it keeps its place, and the law's state advances. */
-void codel_drop(noack_link *link, int64_t stage) {
+void codel_drop(noack_link *link, int64_t stage, int64_t bytes) {
     const noack_bottleneck *settings = &link->stages[stage].bottleneck;
     noack_stage_state *queue = &link->stage_states[stage];
     int64_t now_ns = service_ns(queue);
-    queue_occupy(link, stage, now_ns);
+    queue_occupy(link, stage, now_ns, bytes);
     if (queue->dropping) {
         queue->drops++;
         queue->dropped_before = 1;

@@ -6,9 +6,9 @@
    use_a_delivery_opportunity). The schedule repeats from its last time on. As in its
    DroppingPacketQueue, the limits count the packets that no opportunity has begun to carry.
 
-   The times of all departures are known on arrival, as those of a bottleneck are. The queue's ring
-   has two numbers for each waiting packet: when an opportunity begins to carry it, and how many
-   bytes were put into the queue before it. */
+   The times of all departures are known on arrival, as those of a bottleneck are (tail_drop.c). The
+   queue's ring has the time at which an opportunity begins to carry a packet, instead of that at
+   which it leaves. */
 #include "../core.h"
 
 enum { OPPORTUNITY_BYTES = NOACK_OPPORTUNITY_BYTES, NS_PER_MS = 1000000 };
@@ -35,25 +35,20 @@ static int64_t opportunity_ns(
 
 /* Whether a packet may enter at now_ns; removes packets that are carried until then. */
 static int has_room(
-    const noack_stage *stage, noack_stage_state *queue, const int64_t *ring, int64_t line_bytes,
+    noack_link *link, int64_t number, const noack_stage *stage, int64_t line_bytes,
     int64_t now_ns) {
-    int64_t limit_bytes = stage->opportunities.queue_bytes, waiting_bytes = 0;
-    queue->entry_ns = max_of(queue->entry_ns, now_ns);
-    while (queue->count > 0 && ring[stage->queue_begin + queue->head] <= queue->entry_ns) {
-        queue->head = (queue->head + 2) % stage->queue_places;
-        queue->count -= 2;
-    }
-    if (queue->count > 0)
-        waiting_bytes = queue->total_bytes - ring[stage->queue_begin + queue->head + 1];
-    return queue->count < stage->queue_places
+    int64_t limit_bytes = stage->opportunities.queue_bytes;
+    int64_t waiting_bytes = queue_bytes_at(link, number, now_ns);
+    return link->stage_states[number].count < stage->queue_places
            && (limit_bytes == 0 || waiting_bytes + line_bytes <= limit_bytes);
 }
 
 /* Put a packet into the queue, after has_room; return its departure time. */
 static int64_t carry_packet(
-    const noack_stage *stage, const int64_t *times_ms, noack_stage_state *queue, int64_t *ring,
-    int64_t line_bytes) {
+    noack_link *link, int64_t stage_number, const noack_stage *stage, int64_t line_bytes) {
     const noack_opportunities *settings = &stage->opportunities;
+    const int64_t *times_ms = link->integers;
+    noack_stage_state *queue = &link->stage_states[stage_number];
     int64_t number;
     if (queue->busy_until_ns <= queue->entry_ns) { /* it is empty, and that opportunity is over */
         number = opportunity_after(settings, times_ms, queue->entry_ns);
@@ -72,14 +67,7 @@ static int64_t carry_packet(
     queue->left_bytes += more * OPPORTUNITY_BYTES - line_bytes;
     queue->busy_until_ns = opportunity_ns(settings, times_ms, number);
     queue->used = number - opportunity_after(settings, times_ms, queue->busy_until_ns - 1) + 1;
-    if (queue->count < stage->queue_places)
-        queue->count += 2;
-    else /* a packet that must pass; as in queue_occupy, what is older does not matter */
-        queue->head = (queue->head + 2) % stage->queue_places;
-    int64_t place = (queue->head + queue->count - 2) % stage->queue_places;
-    ring[stage->queue_begin + place] = begin_ns;
-    ring[stage->queue_begin + place + 1] = queue->total_bytes;
-    queue->total_bytes += line_bytes;
+    queue_occupy(link, stage_number, begin_ns, line_bytes);
     return queue->busy_until_ns;
 }
 
@@ -89,13 +77,10 @@ void apply_opportunities(packet *packet, const noack_stage *stage, noack_stage_m
     packet_copy *copy = copy_in(packet);
     if (!copy->exists)
         return;
-    noack_stage_state *queue = &packet->link->stage_states[packet->stage];
-    const int64_t *times_ms = packet->link->integers;
-    int64_t *ring = packet->link->departures_ns;
     int64_t line_bytes =
         max_of(packet->decision->size_bytes + stage->opportunities.overhead_bytes, 1);
-    if (!has_room(stage, queue, ring, line_bytes, copy->time_ns))
+    if (!has_room(packet->link, packet->stage, stage, line_bytes, copy->time_ns))
         lose(packet, NOACK_OVERFLOWED);
     if (copy->exists)
-        copy->time_ns = carry_packet(stage, times_ms, queue, ring, line_bytes);
+        copy->time_ns = carry_packet(packet->link, packet->stage, stage, line_bytes);
 }

@@ -36,12 +36,15 @@ static void change_queue(
     int64_t count = min_of(queue->count, new->queue_places);
     int64_t first = queue->head + queue->count - count;
     for (int64_t k = 0; k < count; k++)
-        after->departures_ns[new->queue_begin + k] =
-            before->departures_ns[old->queue_begin + (first + k) % old->queue_places];
+        memcpy(
+            after->departures_ns + new->queue_begin + 2 * k,
+            before->departures_ns + old->queue_begin + 2 * ((first + k) % old->queue_places),
+            2 * sizeof *after->departures_ns);
     new_queue->head = 0;
     new_queue->count = count;
     new_queue->entry_ns = queue->entry_ns;
     new_queue->busy_until_ns = queue->busy_until_ns;
+    new_queue->total_bytes = queue->total_bytes;
     new_queue->carry = rate_of(new) == rate_of(old) ? queue->carry : 0;
 }
 

@@ -33,6 +33,13 @@ static const char *check_bottleneck(const noack_stage *stage) {
         || !is_between(0, settings->cell_bytes, MOST_BYTES)
         || !is_between(0, settings->cell_overhead_bytes, MOST_CELL_HEADER))
         return "the overhead and cells of a bottleneck must be from 0 to 65,536 bytes";
+    if (!is_between(0, settings->queue_bytes, FAR_NS)
+        || !is_between(0, settings->burst_bytes, FAR_NS)
+        || !is_between(0, settings->burst_ns, FAR_NS)
+        || !is_between(0, settings->burst_carry, settings->rate_bps - 1))
+        return "a bottleneck has a queue or a burst out of range";
+    if (is_scheduler(stage) && (settings->burst_bytes != 0 || settings->burst_ns != 0))
+        return "a queue that chooses what it sends has a burst";
     if (stage->kind == NOACK_CODEL
         && (settings->target_ns < 0 || !is_between(1, settings->interval_ns, FAR_NS / 16)))
         return "CoDel has no target or interval";
@@ -64,9 +71,7 @@ static const char *check_opportunities(const noack_link_settings *link, const no
     if (!is_between(0, settings->offset_ns, FAR_NS) || !is_between(0, settings->queue_bytes, FAR_NS)
         || !is_between(-MOST_BYTES, settings->overhead_bytes, MOST_BYTES))
         return "delivery opportunities have an offset, overhead or queue out of range";
-    if (stage->queue_places < 2 || stage->queue_places % 2 != 0)
-        return "a queue of delivery opportunities needs two numbers for a packet";
-    return NULL;
+    return stage->queue_places < 1 ? "delivery opportunities have no queue" : NULL;
 }
 
 static const char *check_replay(const noack_link_settings *link, const noack_replay *settings) {
@@ -208,16 +213,18 @@ static void set_widths(noack_link *link) {
                            : 1;
 }
 
-/* Which stage chooses, and where each has its queue; return the places of all queues. */
+/* Which stage chooses, and where each has its queue, which has been empty for ever; return the
+   numbers of all rings. */
 static int64_t place_queues(noack_link *link) {
-    int64_t places = 0;
+    int64_t numbers = 0;
     link->scheduler = -1;
-    for (int64_t i = 0; i < link->stage_count; places += link->stages[i++].queue_places) {
-        link->stages[i].queue_begin = places;
+    for (int64_t i = 0; i < link->stage_count; numbers += 2 * link->stages[i++].queue_places) {
+        link->stages[i].queue_begin = numbers;
+        link->stage_states[i].busy_until_ns = -LATEST_NS;
         if (is_scheduler(&link->stages[i]))
             link->scheduler = i;
     }
-    return places;
+    return numbers;
 }
 
 /* Make room for flows; return 0 if there is no memory. */

@@ -103,12 +103,16 @@ typedef struct {
     int64_t begin, end;
 } noack_scripted;
 
-/* A rate limit; the stage's queue_places is the size of the queue. */
+/* A rate limit; the stage's queue_places is the size of the queue in packets. */
 typedef struct {
     int64_t rate_bps;
     int64_t overhead_bytes;
     int64_t cell_bytes;
     int64_t cell_overhead_bytes;
+    int64_t queue_bytes; /* size of the queue in bytes; 0: no limit in bytes */
+    int64_t burst_bytes; /* that a token bucket holds; 0: no bucket */
+    /* time that the rate needs for the burst: burst_ns - burst_carry/rate_bps ns */
+    int64_t burst_ns, burst_carry;
     int64_t target_ns, interval_ns; /* of CoDel */
     int64_t mtu_ns;                 /* transmission time of one MTU */
     /* priority, earliest deadline: the number of each flow, a range of the table of integers; the
@@ -174,8 +178,8 @@ typedef struct {
 typedef struct {
     int64_t kind;
     int64_t key0, key1;   /* key of its random stream: two words of 32 bits */
-    int64_t queue_places; /* places of its ring in departures_ns; 0: no queue */
-    int64_t queue_begin;  /* first of these places */
+    int64_t queue_places; /* packets that its queue can have; 0: no queue */
+    int64_t queue_begin;  /* where its ring begins in departures_ns */
     union {
         noack_chance chance;
         noack_four_state four_state;

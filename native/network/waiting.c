@@ -71,8 +71,11 @@ void enter_queue(packet *packet, int64_t key, int is_time) {
     noack_stage_state *queue = &link->stage_states[packet->stage];
     if (!copy_in(packet)->exists)
         return;
-    noack_queue_enters(link, packet->stage, decision->arrival_ns);
-    if (queue->count + queue->waiting_count >= link->stages[packet->stage].queue_places)
+    const noack_stage *stage = &link->stages[packet->stage];
+    int64_t line_bytes = line_bytes_of(&stage->bottleneck, decision->size_bytes);
+    int64_t sent_bytes = queue_bytes_at(link, packet->stage, decision->arrival_ns);
+    if (queue->count + queue->waiting_count >= stage->queue_places
+        || !fits_queue(&stage->bottleneck, sent_bytes + queue->waiting_bytes, line_bytes))
         lose(packet, NOACK_OVERFLOWED);
     if (!copy_in(packet)->exists)
         return;
@@ -95,6 +98,11 @@ void complete_waiting_decision(packet *packet) {
     decision->after_ns = first_ns == INT64_MAX ? 0 : first_ns - least_ns;
 }
 
+/* The bytes of a waiting packet in the queue. */
+static int64_t waiting_bytes_of(const noack_link *link, int64_t size_bytes) {
+    return queued_bytes(line_bytes_of(&link->stages[link->scheduler].bottleneck, size_bytes));
+}
+
 void wait_for_link(
     noack_link *link, int64_t row, noack_waiting *waiting, int64_t place, int64_t order,
     const noack_decision *decision) {
@@ -112,6 +120,7 @@ void wait_for_link(
     };
     queue->first_waiting = merge(waiting, queue->first_waiting, place + 1);
     queue->waiting_count++;
+    queue->waiting_bytes += waiting_bytes_of(link, decision->size_bytes);
     for (int64_t left = flow->waiting_count; left > 0 && waiting[earlier].key > key; left--) {
         lower_key(queue, waiting, earlier, key);
         earlier = waiting[earlier].before;
@@ -133,6 +142,7 @@ void serve(
         noack_flow *flow = &link->flows[next->row];
         queue->first_waiting = merge(waiting, next->left, next->right);
         queue->waiting_count--;
+        queue->waiting_bytes -= waiting_bytes_of(link, next->size_bytes);
         flow->waiting_count--;
         int64_t end_ns = noack_queue_serve(link, link->scheduler, next->size_bytes);
         int64_t leaves_ns = max_of(end_ns + next->after_ns, next->earliest_ns);

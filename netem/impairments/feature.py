@@ -165,8 +165,12 @@ class StageFeature(Feature):
         """Return the words of ``tc netem`` for it; empty if it has no effect."""
         return self.text()
 
+    def tc_qdisc(self) -> str:
+        """Return the words of another qdisc of tc that has the effect; empty: ``tc netem`` has it."""
+        return ""
+
     def tc_notes(self) -> Sequence[str]:
-        """Return the differences of ``tc netem`` in behaviour."""
+        """Return the differences of tc in behaviour."""
         return ()
 
 

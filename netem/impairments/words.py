@@ -37,6 +37,12 @@ _RATE_UNITS = {"": 1} | {
     for prefix, scale in _PREFIXES.items()
     for unit, bits in (("bit", 1), ("bps", 8))
 }
+_SIZE_UNITS = {"": 1, "b": 1} | {
+    prefix + unit: 1024**power // parts
+    for power, prefix in enumerate("kmg", 1)
+    for unit, parts in (("", 1), ("b", 1), ("bit", 8))
+}
+"""The sizes of tc, which has powers of 1024: kb are 1024 bytes, and kbit 128."""
 _SPACES = " \t\r\n"
 
 
@@ -124,6 +130,14 @@ def _rate_bps(text: str) -> int:
     return int((number * scale).to_integral_value())
 
 
+def _size_bytes(text: str) -> int:
+    number, unit = _split(text)
+    scale = _SIZE_UNITS.get(unit.lower())
+    if scale is None or not 0 <= number * scale < 10**15:
+        raise ValueError
+    return int(number * scale)
+
+
 def _number(text: str) -> float:
     number, unit = _split(text)
     if unit:
@@ -183,6 +197,14 @@ def rate_text(rate_bps: int) -> str:
     return f"{rate_bps}bit"
 
 
+def size_text(size_bytes: int) -> str:
+    """``20kb`` for 20,480 bytes."""
+    for prefix in "gmk":
+        if size_bytes and size_bytes % _SIZE_UNITS[prefix] == 0:
+            return f"{size_bytes // _SIZE_UNITS[prefix]}{prefix}b"
+    return f"{size_bytes}b"
+
+
 def number_text(number: float) -> str:
     """Return a number with all digits."""
     return _digits(Decimal(repr(number)))
@@ -203,6 +225,7 @@ OWN_TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms", _own_time_s, time_
 OWN_TIME_NS = Quantity("a time in s, ms, us or ns, in whole ns, e.g. 10ms", _own_time_ns, time_ns_text)
 """The same, exactly."""
 RATE_BPS = Quantity("a rate in bit, kbit, mbit, gbit, kbps (bytes!), ..., e.g. 1mbit", _rate_bps, rate_text)
+SIZE_BYTES = Quantity("a size in b, kb (1024 bytes), mb or gb, e.g. 20kb", _size_bytes, size_text)
 COUNT = Quantity("a whole number, e.g. 5", _integer("[0-9]{1,20}"))
 SIGNED_COUNT = Quantity("a whole number, e.g. 28 or -14", _integer("-?[0-9]{1,20}"), signs="-")
 NUMBER = Quantity("a number, e.g. 2.5", _number, number_text)

@@ -45,10 +45,10 @@ class Tc:
         """Whether ``tc`` and a compiler are installed."""
         return shutil.which("tc") is not None and shutil.which("gcc") is not None
 
-    def request(self, words: str) -> bytes | None:
+    def request(self, words: str, qdisc: str = "root netem") -> bytes | None:
         """Return the request's attributes for these words; None if tc refuses them."""
         done = subprocess.run(
-            ["tc", "qdisc", "add", "dev", "lo", "root", "netem", *words.split()],
+            ["tc", "qdisc", "add", "dev", "lo", *qdisc.split(), *words.split()],
             env={"LD_PRELOAD": str(self._shim), "PATH": "/usr/sbin:/sbin:/usr/bin:/bin"},
             capture_output=True, check=False, timeout=20,
         )  # fmt: skip
@@ -90,6 +90,28 @@ def test_words_of_tc_have_the_same_meaning_here(tc: Tc, words: str) -> None:
     assert tc.request(command) == tc.request(with_overhead(-ETHERNET_BYTES, words)) is not None
 
 
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        ("rate 10mbit queue 50ms burst 20kb", "rate 10mbit burst 20480 limit 62500"),
+        ("rate 1mbit queue 64kb burst 3000", "rate 1mbit burst 3000 limit 64k"),
+        ("rate 8kbit queue 1mb burst 8kbit", "rate 8kbit burst 8kbit limit 1mb"),
+        ("rate 1mbit 50 queue 20 burst 2kb", "rate 1mbit burst 2k limit 30280 overhead 8"),
+        ("rate 1mbit queue 10ms", "rate 1mbit burst 1514 limit 1250"),
+    ],
+)
+def test_a_bottleneck_with_a_burst_is_a_tbf(tc: Tc, words: str, command: str) -> None:
+    """Alone, and behind the netem of the other words; sizes have the units of tc."""
+    for before in ("", "delay 10ms "):
+        nearest = tc_command(settings_of(before + words))
+        assert nearest.words == (f"limit 16384 {before.strip()}" if before else None)
+        name, _, given = str(nearest.behind).partition(" ")
+        assert name == "tbf"
+        parent = "parent 1:1 handle 2:" if before else "root"
+        assert tc.request(given, f"{parent} tbf") == tc.request(command, f"{parent} tbf") is not None
+        assert nearest.commands[-1] == f"tc qdisc add dev DEVICE {parent} tbf {given}"
+
+
 def with_overhead(more: int, words: str) -> str:
     """Change the overhead of ``rate``: here it is for UDP, in the command for Ethernet."""
     return re.sub(r"rate (\S+) (-?\d+)", lambda at: f"rate {at[1]} {int(at[2]) + more}", words)
@@ -121,14 +143,13 @@ def test_words_that_only_tc_has_are_refused(tc: Tc) -> None:
 def test_each_setting_is_in_the_command_or_named(settings: LinkSettings) -> None:
     command = tc_command(settings)
     wanted = [impairment for impairment in settings.impairments if impairment != LossOf(loss=NoLoss())]
-    kept = 0
-    if command.words is not None:
-        kinds = ("loss", "delay", "duplicate", "corrupt", "reorder", "rate")
-        kept = sum(command.words.split().count(kind) for kind in kinds)
+    kinds = ("loss", "delay", "duplicate", "corrupt", "reorder", "rate")
+    words = f"{command.words} {command.behind}".split()
+    kept = sum(words.count(kind) for kind in kinds)
     own = ("lossrel", "mansd", "first", "atmost", "recover", "ordered")
     left_out = [lack for lack in command.lacks if not lack.startswith(own)]
     assert kept + len(left_out) == len(wanted)
-    assert (command.words is None) == (kept == 0 < len(wanted))
+    assert bool(command.commands) != (kept == 0 < len(wanted))
 
 
 @pytest.mark.parametrize(

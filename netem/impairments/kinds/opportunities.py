@@ -149,7 +149,7 @@ class Opportunities(FileFeature, Impairment):
             "overhead_bytes": self.overhead_bytes,
             "queue_bytes": self.queue_bytes or 0,
         }
-        return Stage(self.kind, numbers, queue_places=2 * self.queue)
+        return Stage(self.kind, numbers, queue_places=self.queue)
 
     def read_file(self, file: NamedFile) -> Self:
         opportunities = self.model_copy(update={"times_ms": _times_ms(file), "file": None})

@@ -33,6 +33,8 @@ WORDS = f"""
     rate 5mbit queue 3 priority 2,1; rate 5mbit queue 50 priority 1,0,1
     rate 5mbit queue 3 maximum_error; rate 5mbit queue 50 maximum_error
     rate 5mbit queue 3 earliest_deadline 1ms,0s; rate 5mbit queue 50 48 48 5 earliest_deadline 0s,300us,100us
+    rate 5mbit queue 3ms; rate 5mbit queue 9kb burst 4kb; rate 5mbit queue 5 burst 1500b codel
+    rate 5mbit queue 4kb priority 1,0; rate 100mbit -20 queue 200us burst 200b
     rate 100mbit queue 5; rate 100mbit queue 5 codel; rate 1gbit -10 48 5
     rate 100mbit queue 5 codel target 10us interval 100us mtu 0
     opportunities at 0,0,1,2,2,2,5 queue 2

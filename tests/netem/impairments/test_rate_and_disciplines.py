@@ -24,7 +24,7 @@ from netem.impairments.feature import Scheduler
 from netem.impairments.kinds.rate import Rate
 from netem.impairments.link_settings import LinkSettings
 from netem.link_state import LinkState
-from netem.tc_words import settings_of
+from netem.tc_words import settings_of, words_of
 from tests.netem.stepped_channel import send
 from tests.netem.stepped_link import Link
 
@@ -93,6 +93,136 @@ def test_a_rate_serves_packets_as_a_queue(rate: Rate, steps: list[tuple[int, int
     assert [core.noack_queue_serve(link, 0, 125)] == departures(other, [(0, 125, False)])
 
 
+@dataclass
+class TokenBucket:
+    """A queue before a bucket of tokens, one for each byte, which a rate fills; times are in ns."""
+
+    rate: Rate
+    tokens: Fraction = Fraction(0)
+    clock: Fraction = Fraction(0)
+    """When there were so many tokens."""
+    waiting: deque[tuple[int, int]] = field(default_factory=deque)
+    """Numbers of packets, and their bytes."""
+    leaves_ns: dict[int, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.tokens = Fraction(self.rate.burst_bytes or 0)
+
+    def serve_until(self, t_ns: int) -> None:
+        """Let leave what leaves until a time, in whole ns."""
+        per_ns = Fraction(self.rate.rate_bps, 8 * NS)
+        while self.waiting:
+            number, size = self.waiting[0]
+            leaves = self.clock + max((size - self.tokens) / per_ns, 0)
+            if int(leaves) > t_ns:
+                return
+            self.waiting.popleft()
+            self.tokens += (leaves - self.clock) * per_ns - size
+            self.clock = leaves
+            self.leaves_ns[number] = int(leaves)
+        if self.clock < t_ns:
+            burst = self.rate.burst_bytes or 0
+            self.tokens = min(self.tokens + (t_ns - self.clock) * per_ns, Fraction(burst))
+            self.clock = Fraction(t_ns)
+
+    def enters(self, size: int) -> bool:
+        """Whether there is room, and the bucket is large enough."""
+        rate, most_bytes = self.rate, self.rate.queue_bytes
+        if rate.queue_s is not None:
+            most_bytes = int(Fraction(str(rate.queue_s)) * rate.rate_bps / 8)
+        if rate.burst_bytes is not None and size > rate.burst_bytes:
+            return False
+        if most_bytes is None:
+            return len(self.waiting) < rate.queue
+        return sum(max(size, 1) for _, size in self.waiting) + max(size, 1) <= most_bytes
+
+
+def bucket_departures(rate: Rate, mansd: int | None, arrivals: Sequence[tuple[int, int]]) -> list[int]:
+    """Return departures in whole ns; −1 if a packet is lost; at most mansd in a row are."""
+    line, losses = TokenBucket(rate), 0
+    for number, (t_ns, size_bytes) in enumerate(arrivals):
+        line.serve_until(t_ns)
+        size = bits(rate, size_bytes) // 8
+        if losses == mansd or line.enters(size):
+            line.waiting.append((number, size))
+            losses = 0
+        else:
+            losses += 1
+    line.serve_until(2**62)
+    return [line.leaves_ns.get(number, -1) for number in range(len(arrivals))]
+
+
+queue_sizes = st.one_of(
+    st.builds(dict, queue=st.integers(1, 6)),
+    st.builds(dict, queue_bytes=st.sampled_from([1, 28, 100, 1500, 4000, 20_000])),
+    st.builds(dict, queue_s=st.sampled_from([0.0012345, 0.05, 1.0])),
+)
+shaped = st.builds(
+    lambda size, **others: Rate(**others, **size),
+    queue_sizes,
+    rate_bps=st.sampled_from([9_600, 1_000_003, 10**7, 10**9]),
+    burst_bytes=st.sampled_from([None, 1, 100, 1528, 5000, 20_480]),
+    overhead_bytes=st.sampled_from([-40, 0, 28]),
+    cell_bytes=st.sampled_from([0, 48]),
+    cell_overhead_bytes=st.just(5),
+)
+bursts_of_packets = st.lists(
+    st.tuples(
+        st.sampled_from([0, 0, 0, 1, 1000, 10**5, 10**6, 10**9]), st.sampled_from([0, 1, 40, 72, 1472, 2000])
+    ),
+    max_size=60,
+)
+
+
+def timed(steps: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    times = np.cumsum([gap for gap, _ in steps]).tolist()
+    return [(t, size) for t, (_, size) in zip(times, steps, strict=True)]
+
+
+@given(shaped, st.sampled_from([None, None, 0, 1, 3]), bursts_of_packets)
+@example(Rate(rate_bps=10**7, queue_s=0.05, burst_bytes=20_480), None, [(0, 1472)] * 60)
+def test_a_burst_is_a_token_bucket_and_its_queue_has_bytes_or_a_time(
+    rate: Rate, mansd: int | None, steps: list[tuple[int, int]]
+) -> None:
+    """Each departure is that of a simulation of the bucket in fractions, and so is each loss."""
+    arrivals = timed(steps)
+    settings = LinkSettings(impairments=(rate,), mansd=mansd, limit=1_000_000)
+    link = Link(settings, 0, "a")
+    decided = [link.decide(0, size, t).release_ns for t, size in arrivals]
+    assert decided == bucket_departures(rate, mansd, arrivals)
+    assert settings_of(words_of(settings)) == settings
+
+
+def test_a_burst_passes_at_once_and_the_rate_the_rest(decide: Any) -> None:
+    """By hand: 1000 bytes take 1 ms; the bucket has 3000, the queue 2000."""
+    words, sizes = "rate 8mbit 0 queue 2000b burst 3000b", 1000
+    decided = decide(words, 8, sizes_bytes=sizes, arrivals_ns=[0] * 6 + [1_500_000, 99 * MS])
+    assert decided.fates.tolist() == [0, 0, 0, 0, 0, 4, 0, 0]
+    assert decided.delays_ns.tolist() == [0, 0, 0, MS, 2 * MS, 1_500_000, 0]
+    # What is longer than the bucket is lost; if it must pass, it waits for the missing bytes.
+    decided = decide(f"{words} mansd 1", 3, sizes_bytes=4000, arrivals_ns=10 * MS)
+    assert decided.fates.tolist() == [4, 2, 4]
+    assert decided.delays_ns.tolist() == [MS]
+
+
+@given(shaped, shaped, bursts_of_packets, st.integers(0, 60))
+def test_a_change_keeps_the_bucket_and_the_order(
+    rate: Rate, other: Rate, steps: list[tuple[int, int]], change_at: int
+) -> None:
+    arrivals = timed(steps)
+    for later in (rate, other):
+        settings = [LinkSettings(impairments=(impairment,), limit=1_000_000) for impairment in (rate, later)]
+        link, decided = Link(settings[0], 0, "a"), []
+        for number, (t, size) in enumerate(arrivals):
+            if number == change_at:
+                link.change(settings[1])
+            decided.append(link.decide(0, size, t).release_ns)
+        if later is rate:
+            assert decided == bucket_departures(rate, None, arrivals)
+        leaves_ns = [t for t in decided if t >= 0]
+        assert leaves_ns == sorted(leaves_ns)
+
+
 def test_packets_lost_before_the_queue_and_dropped_copies_use_no_line_time(decide: Any) -> None:
     for words, last_s in (("loss worst rate 8kbit 0", 3), ("rate 8kbit 0 loss worst", 5)):
         decided = decide(f"{words} mansd 1 first", 5, sizes_bytes=1000, arrivals_ns=0)
@@ -146,6 +276,8 @@ class RfcCodel:
     lastcount: int = 0
     dropping: bool = False
     leaves_ns: dict[int, int | None] = field(default_factory=dict)
+    burst_ns: int = 0
+    """Time that the rate needs for a burst: so much earlier a packet may leave."""
 
     def control_law(self, t: int, count: int) -> int:
         return t + int(self.interval_ns / math.sqrt(count))
@@ -202,8 +334,9 @@ class RfcCodel:
             now = max(self.free_ns, self.queue[0].enqueued_ns)
             packet = self.dequeue(now)
             if packet:
-                self.free_ns = now + packet.size_bytes * PER_BYTE_NS
-                self.leaves_ns[packet.number] = self.free_ns
+                full_ns = packet.enqueued_ns - self.burst_ns
+                self.free_ns = max(self.free_ns, full_ns) + packet.size_bytes * PER_BYTE_NS
+                self.leaves_ns[packet.number] = max(self.free_ns, packet.enqueued_ns)
         if self.free_ns <= t_ns and not self.queue:
             self.dequeue(self.free_ns)
 
@@ -214,7 +347,11 @@ def at_most_one_mtu_ahead(mtu_bytes: int) -> Callable[[RfcCodel, Packet, int], b
 
 
 def codel_departures(
-    arrivals: Sequence[tuple[int, int]], codel: Codel, spare: Any, mansd: int | None = None
+    arrivals: Sequence[tuple[int, int]],
+    codel: Codel,
+    spare: Any,
+    mansd: int | None = None,
+    burst_bytes: int = 0,
 ) -> list[int | None]:
     """Return departures in ns, None if dropped; arrivals are (ns, bytes), ascending."""
     leaves_ns: dict[int, int | None] = {}
@@ -225,7 +362,7 @@ def codel_departures(
 
     line = RfcCodel(
         round(codel.target_s * 1e9), round(codel.interval_s * 1e9), spare, must_pass,
-        leaves_ns=leaves_ns,
+        leaves_ns=leaves_ns, burst_ns=burst_bytes * PER_BYTE_NS, free_ns=-burst_bytes * PER_BYTE_NS,
     )  # fmt: skip
     for number, (t_ns, size_bytes) in enumerate(arrivals):
         line.serve_until(t_ns)
@@ -235,9 +372,15 @@ def codel_departures(
 
 
 def emulated_departures(
-    arrivals: Sequence[tuple[int, int]], codel: Codel, mansd: int | None = None
+    arrivals: Sequence[tuple[int, int]], codel: Codel, mansd: int | None = None, burst_bytes: int = 0
 ) -> list[int | None]:
-    rate = Rate(rate_bps=RATE_BPS, queue=100_000, overhead_bytes=0, discipline=codel)
+    rate = Rate(
+        rate_bps=RATE_BPS,
+        queue=100_000,
+        burst_bytes=burst_bytes or None,
+        overhead_bytes=0,
+        discipline=codel,
+    )
     link = Link(LinkSettings(impairments=(rate,), mansd=mansd, limit=1_000_000), 0, "a")
     releases_ns = [link.decide(0, size, t).release_ns for t, size in arrivals]
     return [None if t_ns < 0 else t_ns for t_ns in releases_ns]
@@ -248,16 +391,17 @@ def emulated_departures(
     st.sampled_from([0.0001, 0.001, 0.005]),
     st.sampled_from([0.0001, 0.002, 0.02]),
     st.sampled_from([None, 1, 3]),
+    st.sampled_from([0, 0, 1500, 20_000]),
 )
 def test_codel_drops_what_the_rfc_drops_and_serves_what_must_pass(
-    steps: list[tuple[int, int]], target_s: float, interval_s: float, mansd: int | None
+    steps: list[tuple[int, int]], target_s: float, interval_s: float, mansd: int | None, burst_bytes: int
 ) -> None:
     """Packets that must pass are served, and the law drops the next packet that need not pass."""
     times = np.cumsum([gap for gap, _ in steps]).tolist()
     arrivals = [(t, size) for t, (_, size) in zip(times, steps, strict=True)]
     codel = Codel(target_s=target_s, interval_s=interval_s, mtu_bytes=100)
-    assert emulated_departures(arrivals, codel, mansd) == codel_departures(
-        arrivals, codel, at_most_one_mtu_ahead(100), mansd
+    assert emulated_departures(arrivals, codel, mansd, burst_bytes) == codel_departures(
+        arrivals, codel, at_most_one_mtu_ahead(100), mansd, burst_bytes
     )
 
 
@@ -278,10 +422,18 @@ def scheduled_departures(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[
     scheduler, free = rate.discipline, Fraction(0)
     assert isinstance(scheduler, Scheduler)
     waiting: list[tuple[int, int]] = []
+    sent_bytes = 0
     leaves_ns, losses, burst = [-1] * len(arrivals), [], Counter[int]()
 
+    def enters(now_ns: int, size: int) -> bool:
+        is_sending = int(free) > now_ns
+        if rate.queue_bytes is None:
+            return len(waiting) + is_sending < rate.queue
+        queued = [bits(rate, arrivals[number][2]) // 8 for _, number in waiting] + [sent_bytes] * is_sending
+        return sum(queued) + bits(rate, size) // 8 <= rate.queue_bytes
+
     def serve(now_ns: int) -> None:
-        nonlocal free
+        nonlocal free, sent_bytes
         while waiting and int(free) <= now_ns:
             keys = {arrivals[number][1]: key for key, number in sorted(waiting, reverse=True)}
             first = min((keys[arrivals[number][1]], number) for _, number in waiting)[1]
@@ -289,10 +441,11 @@ def scheduled_departures(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[
             arrival_ns, _, size, _ = arrivals[first]
             free = max(free, Fraction(arrival_ns)) + Fraction(bits(rate, size) * NS, rate.rate_bps)
             leaves_ns[first] = int(free)
+            sent_bytes = bits(rate, size) // 8
 
     for number, (now_ns, flow, size, level) in enumerate(arrivals):
         serve(now_ns)
-        passes = burst[flow] == mansd or len(waiting) + (int(free) > now_ns) < rate.queue
+        passes = burst[flow] == mansd or enters(now_ns, size)
         burst[flow] = 0 if passes else burst[flow] + 1
         losses.append(burst[flow])
         if passes:
@@ -333,7 +486,7 @@ def core_departures(settings: LinkSettings, arrivals: Any) -> tuple[list[int], l
 @pytest.mark.parametrize("kind", [Priority, EarliestDeadline, MaximumError])
 @given(
     st.sampled_from([1000, 9_600, 1_000_003, 10**9]),
-    st.integers(1, 6),
+    st.integers(1, 6) | st.sampled_from([1000, 3000, 6000]),
     st.lists(st.integers(0, 3), min_size=1, max_size=4).map(tuple),
     st.lists(
         st.tuples(
@@ -359,7 +512,8 @@ def test_a_scheduler_sends_the_first_of_what_waits_when_the_link_is_free(
         discipline = Priority(levels=numbers)
     elif kind is EarliestDeadline:
         discipline = EarliestDeadline(deadlines_s=tuple(number * 0.05 for number in numbers))
-    rate = Rate(rate_bps=rate_bps, queue=queue, discipline=discipline)
+    size = {"queue": queue} if queue < 1000 else {"queue_bytes": queue}
+    rate = Rate(rate_bps=rate_bps, **size, discipline=discipline)
     now = np.cumsum([0, *(gap for gap, *_ in steps)])[1:].tolist()
     arrivals = [(t, *step) for t, (_, *step) in zip(now, steps, strict=True)]
     outcome = core_departures(LinkSettings(impairments=(rate,), mansd=mansd), arrivals)
