@@ -53,6 +53,15 @@ static int64_t newest_below(
     return number;
 }
 
+/* Whether an effectively delivered packet becomes stale if a later one leaves at release_ns. What
+   has left does not, whatever the times are: an arrival may have an earlier time than a departure
+   before it, if a clock runs backward or a packet leaves before it is due. */
+static int becomes_stale(const noack_link *link, int64_t row, int64_t number, int64_t release_ns) {
+    const int64_t *recent_ns = link->recent_ns + row * link->recent_width;
+    return number > link->flows[row].newest
+           && recent_ns[number & (link->recent_width - 1)] > release_ns;
+}
+
 /* The number of effectively delivered packets between `delivered` and `packet` that must at least
    remain so: each takes one loss from every window. 0: all packets between them may be lost. */
 static int64_t needed_after(
@@ -76,8 +85,8 @@ static int64_t needed_after(
 /* The earliest time, not before desired_ns, at which a packet may leave.
 
    The ring recent_ns has the previous packets' release times, of mansd + 1 at least; -1 for packets
-   that are not effectively delivered. The others ascend. Without a maximum of consecutive losses,
-   only the first packet can be needed. */
+   that are not effectively delivered. Of the others, those that have not left ascend. Without a
+   maximum of consecutive losses, only the first packet can be needed. */
 int64_t noack_hold_back_until(
     const noack_link *link, int64_t row, int64_t packet, int64_t desired_ns) {
     const int64_t *recent_ns = link->recent_ns + row * link->recent_width;
@@ -87,7 +96,7 @@ int64_t noack_hold_back_until(
     if (link->scheduler >= 0) /* each flow leaves in its order; see waiting.c */
         return release_ns;
     int64_t delivered = newest_below(recent_ns, recent_mask, oldest, packet);
-    while (delivered >= oldest && recent_ns[delivered & recent_mask] > release_ns)
+    while (delivered >= oldest && becomes_stale(link, row, delivered, release_ns))
         delivered = newest_below(recent_ns, recent_mask, oldest, delivered);
     int64_t first = delivered + 1, needed = 0;
     for (int64_t number = first; number < packet; number++) {
@@ -113,7 +122,7 @@ int64_t make_stale(const noack_link *link, int64_t row, int64_t packet, int64_t 
     int64_t recent_mask = link->recent_width - 1, oldest = max_of(packet - link->mansd - 1, 0);
     int64_t stale = 0, first = packet;
     int64_t number = newest_below(recent_ns, recent_mask, oldest, packet);
-    while (number >= oldest && recent_ns[number & recent_mask] > release_ns) {
+    while (number >= oldest && becomes_stale(link, row, number, release_ns)) {
         recent_ns[number & recent_mask] = NOACK_NEVER_NS;
         stale++;
         first = number;

@@ -86,14 +86,18 @@ def send_all(
     link: Link,
     steps: Sequence[tuple[int, int]],
     late: Callable[[], bool] = lambda: False,
+    early: Callable[[], bool] = lambda: False,
     before_each: Callable[[], None] = lambda: None,
 ) -> tuple[Receiver, dict[int, int]]:
-    """Send datagrams at their times; before each, serve the due timers unless ``late()``."""
+    """Send datagrams at their times; before each, serve the due timers unless ``late()``.
+
+    Timers that are not due are served if ``early()``.
+    """
     receiver, sent = Receiver(), dict[int, int]()
     now_ns = 0
     for flow, gap_ns in steps:
         now_ns += gap_ns
-        while (due := link.next_deadline_ns()) is not None and due <= now_ns and not late():
+        while (due := link.next_deadline_ns()) is not None and (not late() if due <= now_ns else early()):
             receiver.take(link.on_timer(now_ns))
         before_each()
         number = sent.get(flow, 0)
@@ -124,12 +128,19 @@ def assert_kept(settings: LinkSettings, link: Link, receiver: Receiver, sent: An
 @pytest.mark.parametrize("change", ["no", "with the same guarantee", "with another guarantee"])
 @given(
     st.lists(links, min_size=2, max_size=4), arrivals, st.integers(0, 2**32),
-    st.sampled_from([0.0, 0.3, 0.9]),
+    st.sampled_from([0.0, 0.3, 0.9]), st.sampled_from([0.0, 0.3]),
 )  # fmt: skip
-def test_the_guarantee_holds_with_late_timers_and_changes(
-    change: str, stages: list[LinkSettings], steps: list[tuple[int, int]], seed: int, late: float
+def test_the_guarantee_holds_with_late_and_early_timers_and_changes(
+    change: str,
+    stages: list[LinkSettings],
+    steps: list[tuple[int, int]],
+    seed: int,
+    late: float,
+    early: float,
 ) -> None:
-    """Even if datagrams arrive before overdue timers are served, and if the settings change.
+    """Even if datagrams arrive before overdue timers are served, or leave before they are due.
+
+    And if the settings change.
 
     Another guarantee holds for all later arrivals, whatever is in flight or was lost before.
     """
@@ -147,7 +158,9 @@ def test_the_guarantee_holds_with_late_timers_and_changes(
             in_force = in_force.model_copy(update=own) if same else in_force
             link.change(in_force)
 
-    receiver, sent = send_all(link, steps, lambda: rng.random() < late, change_sometimes)
+    receiver, sent = send_all(
+        link, steps, lambda: rng.random() < late, lambda: rng.random() < early, change_sometimes
+    )
     assert_kept(in_force, link, receiver, sent)
     if same:  # the same guarantee holds across the changes, too
         assert all(is_allowed(receiver.lost(*of_flow), in_force) for of_flow in sent.items())
@@ -155,6 +168,9 @@ def test_the_guarantee_holds_with_late_timers_and_changes(
 
 @settings(max_examples=30)
 @given(links, st.integers(0, 2**32), st.integers(1, 80))
+@example(
+    settings_of("rate 5mbit queue 50 reorder 100% gap 4 atmost 3 in 4 atmost 3 in 5 recover 2 limit 1"), 0, 10
+)  # 1 leaves early; 3 arrives at an earlier time
 def test_the_guarantee_needs_no_clock(settings: LinkSettings, seed: int, count: int) -> None:
     """Arrival times in any order, timers served too early."""
     link = Link(settings, 1, "a")
@@ -171,6 +187,33 @@ def test_the_guarantee_needs_no_clock(settings: LinkSettings, seed: int, count: 
         receiver.take(link.on_timer(0))
     for flow, sent_count in enumerate(sent):
         assert is_allowed(receiver.lost(flow, sent_count), settings)
+
+
+@pytest.mark.parametrize("served_ms", [0, 20])  # before it is due; or when it is, and the clock runs backward
+@pytest.mark.parametrize(
+    ("words", "delays_ms", "held_back", "lost"),
+    [
+        # If 3 left before 2, then 1 would part the burst 0 from the burst 2.
+        ("mansd 3 recover 2", [None, 9, 9, 0], 1, [True, False, False, False]),
+        # 2 may leave before 1, since 0 is not lost.
+        ("mansd 1", [9, 4, 0], 0, [False, True, False]),
+        ("atmost 1 in 3", [9, 4, 0], 0, [False, True, False]),
+    ],
+)
+def test_what_has_left_does_not_become_stale(
+    served_ms: int, words: str, delays_ms: list[int | None], held_back: int, lost: list[bool]
+) -> None:
+    """One datagram arrives per ms; the first one that is not lost leaves before the next arrives."""
+    outcomes = iter(None if delay_ms is None else delay_ms * MS for delay_ms in delays_ms)
+    link, receiver = Link(settings_of(words), 1, "a", network=lambda data, now_ns: next(outcomes)), Receiver()
+    for number in range(len(delays_ms)):
+        receiver.take(link.handle(Datagram(0, payload(0, number)), number * MS))
+        if not receiver.counted and link.next_deadline_ns() is not None:
+            receiver.take(link.on_timer(served_ms * MS))
+    while link.next_deadline_ns() is not None:
+        receiver.take(link.on_timer(0))
+    assert receiver.lost(0, len(delays_ms)) == lost
+    assert link.counters.held_back == held_back
 
 
 @given(
