@@ -133,7 +133,7 @@ def test_i1_is_claimed_of_the_estimate(
     record = run(observed)
     claims = RunClaims(record)
     evaluated = claims.evaluate()
-    assert {claim.source for claim in evaluated} == {"(I1)", "certificate"}
+    assert {claim.source for claim in evaluated} == {"(I1)", "certificate", "network"}
     assert {claim.verdict for claim in evaluated if claim.source == "(I1)"} == {"held"}
     assert any("x_c − x̂" in claim.bound for claim in evaluated)
     # Relative to the plant's own state the claim of (I1) would not hold, so it is not claimed.
