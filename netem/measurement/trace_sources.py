@@ -8,9 +8,9 @@ through the emulator's link: its delays are those of waiting for the next opport
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,10 +25,14 @@ from netem.impairments.link_settings import LinkSettings
 from netem.link_state import LinkState
 from netem.traces.capture_packets import is_capture
 from netem.traces.capture_trace import CaptureFileError, CaptureOptions, read_captures
+from netem.traces.captured_flows import Capture
+from netem.traces.fping_log import is_fping, read_targets
+from netem.traces.iperf3_report import is_iperf3
 from netem.traces.numbered_datagrams import SequenceField
 from netem.traces.packet_trace import (
     FILE_ERRORS,
     LOST_NS,
+    MAX_PACKETS,
     PacketTrace,
     decompressed,
     file_problem,
@@ -40,7 +44,7 @@ from netem.traces.packet_trace import (
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-_HEAD_BYTES = 64
+_HEAD_BYTES = 1024
 """Bytes by which a file is recognised."""
 USUAL_PERIOD_NS = 20_000_000
 _SHORTEST_PERIOD_S, _LONGEST_PERIOD_S = 50e-6, 3600.0
@@ -137,6 +141,11 @@ def read_files(
             "expected one file, or two captures (pcap, pcapng): that of the sender's end, then "
             "that of the receiver's"
         )
+    if is_iperf3(heads[0]):
+        raise CallerError(f"{first_path}: a report of iperf3 has losses per interval, and no packets")
+    if is_fping(heads[0]):
+        refuse_unused(options, FILE_OPTIONS, "a log of fping", "flow")
+        return _of_target(_targets(first_path), options.flow, first_path)
     if is_opportunity_file(heads[0]):
         if is_compressed(first_path):
             raise CallerError(
@@ -146,6 +155,95 @@ def read_files(
         return read_opportunities(first_path, options.period_ns)
     refuse_unused(options, FILE_OPTIONS, "a packet trace", "clocks_differ")
     return read_trace(first_path, clocks_differ=bool(options.clocks_differ), others=(*others, _OPPORTUNITIES))
+
+
+class FlowTrace(NamedTuple):
+    """One of the flows of a source."""
+
+    number: int
+    """For ``--flow``."""
+    name: str
+    trace: PacketTrace | None
+    problem: str
+    """Why there is no trace."""
+
+
+MOST_FLOWS = 50
+"""Flows of a capture that are measured at once, the largest ones."""
+
+
+def read_flows(paths: Sequence[Path], options: SourceOptions | None = None) -> tuple[list[FlowTrace], int]:
+    """Return the flows of captures, or the targets of a log of fping, and how many more there are.
+
+    Raises:
+        NoackError: one line; it cannot be read, or is of another kind, which has one flow.
+    """
+    options = options or SourceOptions()
+    if not paths:
+        raise CallerError("no file is given; give a capture, or a log of fping")
+    for name, value in (("--flow", options.flow), ("--far-flow", options.far_flow)):
+        if value not in (1, None):
+            raise CallerError(f"{name} {value}: has no effect beside --flows, which measures all flows")
+    heads = [_head(path) for path in paths]
+    if len(paths) == 1 and is_fping(heads[0]):
+        refuse_unused(options, FILE_OPTIONS, "a log of fping")
+        traces = _targets(paths[0])
+        flows = [FlowTrace(number, name, trace, "") for number, (name, trace) in enumerate(traces.items(), 1)]
+        return flows[:MOST_FLOWS], max(len(flows) - MOST_FLOWS, 0)
+    if not all(map(is_capture, heads)) or len(paths) > 2:
+        raise CallerError(
+            "--flows: is for captures (pcap, pcapng) and for logs of fping; other sources have one flow"
+        )
+    refuse_unused(options, FILE_OPTIONS, "captures", *_CAPTURE_OPTIONS)
+    names = _flow_names(paths[0])
+    flows = []
+    for number, name in enumerate(names[:MOST_FLOWS], 1):
+        try:
+            trace = _from_captures(paths, replace(options, flow=number))
+            flows.append(FlowTrace(number, name, trace, ""))
+        except CallerError as error:
+            flows.append(FlowTrace(number, name, None, _without_path(str(error), paths)))
+    return flows, max(len(names) - MOST_FLOWS, 0)
+
+
+def is_iperf3_file(path: Path) -> bool:
+    """Whether a file is a report of iperf3, which :mod:`netem.traces.iperf3_report` reads."""
+    return not path.is_dir() and is_iperf3(_head(path))
+
+
+def _flow_names(path: Path) -> list[str]:
+    try:
+        with open_regular(path) as file:
+            return [str(flow) for flow in Capture(decompressed(file)[1]).flows]
+    except FILE_ERRORS as error:
+        raise CallerError(f"{path}: {file_problem(error)}") from None
+
+
+def _without_path(message: str, paths: Sequence[Path]) -> str:
+    for path in paths:
+        message = message.removeprefix(f"{path}: ")
+    return message
+
+
+def _targets(path: Path) -> Mapping[str, PacketTrace]:
+    try:
+        with open_regular(path) as file:
+            return read_targets(decompressed(file)[1], MAX_PACKETS)
+    except FILE_ERRORS as error:
+        raise CallerError(f"{path}: {file_problem(error)}") from None
+
+
+def _of_target(traces: Mapping[str, PacketTrace], number: int, path: Path) -> PacketTrace:
+    """Return the trace of a target of fping; 1 is the first."""
+    if not 1 <= number <= len(traces):
+        raise CallerError(f"{path}: has no flow {number}; its targets are flows 1 to {len(traces)}")
+    target, trace = list(traces.items())[number - 1]
+    others = (
+        f"; --flow chooses another of the {len(traces)} targets, --flows measures all"
+        if len(traces) > 1
+        else ""
+    )
+    return trace.noted(f"flow {number}: {target}{others}")
 
 
 def _head(path: Path) -> bytes:

@@ -39,9 +39,9 @@ def fill(folder: Path) -> Path:
     """Give a folder the repository's files and a short run; return it."""
     (folder / "scenarios").symlink_to(ROOT / "scenarios")
     (folder / "docs").symlink_to(ROOT / "docs")
-    links, preset = blocks("docs/netem.md", "toml")
+    links, office = blocks("docs/netem.md", "toml")
     (folder / "links.toml").write_text(links)
-    (folder / "office.toml").write_text(preset)
+    (folder / "office.toml").write_text(office)
     for code in [*blocks("docs/plants.md", "python"), *blocks("docs/plants.md", "toml")]:
         if (named := re.match(r"# (\w+\.(?:py|toml))\n", code)) is not None:
             (folder / named[1]).write_text(code)
@@ -51,7 +51,8 @@ def fill(folder: Path) -> Path:
     run = invoke("simulate", "lane_following", "--set=horizon_s=2", "--no-report", "--runs", folder / "runs")
     assert run.exit_code == 0, run.stderr
     network = ("--deadline", "100ms", "--as", "model", "--write", folder / "urban.toml")
-    assert invoke("measure", "urban_n78_40kmh", *network).exit_code == 0
+    preset = ("--preset", str(folder / "rural.toml"))
+    assert invoke("measure", "urban_n78_40kmh", *network, *preset).exit_code == 0
     for name in ("model", "hold"):  # two runs for `compare`, as commands run in any order
         (folder / "runs" / name).mkdir()
         (folder / "runs" / name / "latest").symlink_to((folder / "runs/latest").resolve())

@@ -1,6 +1,7 @@
 """``noack measure``: losses, delays and the M of a real network."""
 
 import re
+from collections.abc import Mapping
 from decimal import Decimal
 from enum import StrEnum
 from pathlib import Path
@@ -64,11 +65,14 @@ def measure(
         list[str],
         Argument(
             metavar="FILE",
-            help="A packet trace, the name of a shipped one, JSON of irtt, captures of both ends, "
-            "a run directory, or delivery opportunities.",
+            help="A packet trace, the name of a shipped one, JSON of irtt or iperf3, a log of ping or "
+            "fping, captures of both ends, a run directory, or delivery opportunities.",
         ),
     ],
     flow: Annotated[int, Option(help="Flow of a capture; 1 is the largest.")] = 1,
+    flows: Annotated[
+        bool, Option("--flows", help="Measure all flows of a capture, a row each, the worst first.")
+    ] = False,
     far_flow: Annotated[
         int | None,
         Option(
@@ -178,7 +182,7 @@ def measure(
     from netem.measurement.loss_bursts import WINDOWS
     from netem.measurement.measured_preset import preset_path
     from netem.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
-    from netem.measurement.trace_sources import SourceOptions
+    from netem.measurement.trace_sources import FILE_OPTIONS, SourceOptions, is_iperf3_file, refuse_unused
     from netem.traces.packet_trace import find_trace
 
     options = MeasurementOptions(
@@ -200,12 +204,35 @@ def measure(
     request = OutputRequest(out, figures, write, form.value, scenario, preset_file)
     differ = None if clocks is None else clocks is ClockRelation.DIFFERENT
     reading = SourceOptions(differ, flow, far_flow, sequence_at, bits, numbers, _period_ns(rate))
-    trace = read_source([*map(find_trace, sources)], reading)
+    paths = [*map(find_trace, sources)]
+    single = {"--for": for_scenario, "--out": out, "--write": write, "--preset": preset}
+    if len(paths) == 1 and is_iperf3_file(paths[0]):
+        from cosim.measurement.iperf3_table import iperf3_document
+
+        needs_packets = {"--deadline": deadline, "--outage": outage, "--survival": survival, "--share": share}
+        _refuse(single | needs_packets | {"--window": window}, "needs packets; iperf3 counts per interval")
+        refuse_unused(reading, FILE_OPTIONS, "a report of iperf3")
+        show(iperf3_document(paths[0]), json=json)
+        return
+    if flows:
+        from cosim.measurement.flow_table import flows_document
+
+        _refuse(single, "is of one flow; give --flow N in place of --flows")
+        show(flows_document(paths, reading, options), json=json)
+        return
+    trace = read_source(paths, reading)
     measurement = NetworkMeasurement(trace, options, " ".join(sources), trace.notes)
     document, written = write_outputs(measurement, request)
     show(document, json=json, written=[str(path) for path in written])
     if not json:
         print(*(f"written: {path}" for path in written), sep="\n", end="\n" * bool(written))
+
+
+def _refuse(given: Mapping[str, object], reason: str) -> None:
+    """Refuse the first option that has a value."""
+    for option, value in given.items():
+        if value is not None:
+            raise CallerError(f"{option}: {reason}")
 
 
 def _period_ns(rate: str) -> int:

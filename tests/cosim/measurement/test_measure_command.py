@@ -1,6 +1,7 @@
 """``noack measure``: the same numbers in JSON, tables and page, a written model, no losses."""
 
 import json
+import struct
 from pathlib import Path
 
 import pytest
@@ -15,8 +16,10 @@ from netem.tc_words import settings_of
 from noack.scenario.sections import NetworkSection
 from tests.helpers.command_line import invoke
 from tests.netem.measurement.chains import chain_losses, trace_of
+from tests.oracles.capture_files import Sent, pcap_of
 
 RURAL = Path(__file__).parents[3] / "netem/traces/shipped/cicv5g" / "rural_n8_10kmh.csv"
+TRACES = Path(__file__).parents[2] / "netem/traces"
 IRTT = Path(__file__).parents[2] / "netem/traces" / "irtt.json"
 
 
@@ -176,3 +179,56 @@ def test_a_measured_preset_is_a_network_of_the_emulator(
     Path("none.csv").write_text("sent_ms,received_ms\n0,0\n5,5\n")
     nothing = measure("none.csv", "--preset", "none")
     assert "neither losses nor delays" in nothing.output
+
+
+def test_a_report_of_iperf3_says_what_its_intervals_say() -> None:
+    text = " ".join(measure(TRACES / "iperf3_receiver.json").output.split())
+    assert "3.0 % lost, M is at least 2" in text
+    assert "iperf3 counts losses per interval, not per packet" in text
+    document = json.loads(measure(TRACES / "iperf3_sender.json", "--json").stdout)
+    assert [stream["stream"] for stream in document["streams"]] == [2, 1]  # the worst first
+    refused = measure(TRACES / "iperf3_receiver.json", "--survival", "1s")
+    assert refused.exit_code == 2
+    assert "--survival: needs packets; iperf3 counts per interval" in refused.output
+
+
+def test_a_log_of_ping_is_measured_and_flows_are_compared(tmp_path: Path) -> None:
+    document = json.loads(measure(TRACES / "ping.txt", "--json").stdout)
+    assert (document["packets"], document["lost"], document["longest"]["losses"]) == (40, 11, 4)
+    log = tmp_path / "fping.txt"
+    log.write_text(
+        "a.example : [0], 64 bytes, 1.00 ms (1.00 avg, 0% loss)\n"
+        "b.example : [0], timed out (NaN avg, 100% loss)\n"
+        "a.example : [1], 64 bytes, 1.10 ms (1.05 avg, 0% loss)\n"
+        "b.example : [1], 64 bytes, 9.00 ms (9.00 avg, 50% loss)\n"
+    )
+    document = json.loads(measure(log, "--flows", "--json").stdout)
+    assert [(flow["flow"], flow["name"], flow["loss_rate"]) for flow in document["flows"]] == [
+        (2, "b.example", 0.5),
+        (1, "a.example", 0.0),
+    ]
+    text = " ".join(measure(log, "--flows").output.split())
+    assert "flow 2 is the worst of 2: 50.0 % lost" in text
+    for words in (("--flow", "2"), ("--write", tmp_path / "n.toml"), ("--preset", "x")):
+        assert measure(log, "--flows", *words).exit_code == 2
+    assert "other sources have one flow" in measure("urban_n78_40kmh", "--flows").output
+
+
+def test_all_flows_of_a_capture_are_rows_and_the_worst_is_the_first(tmp_path: Path) -> None:
+    """Three senders with numbers at one receiver; the second loses every third, the third every tenth."""
+    capture, packets = tmp_path / "receiver.pcap", []
+    for port, lost_of in ((5001, 0), (5002, 3), (5003, 10)):
+        for k in range(300):
+            if not lost_of or k % lost_of != 1:
+                at_ns = 1_700_000_000 * 10**9 + k * 20_000_000 + port
+                packets.append(Sent(at_ns, struct.pack(">HQ", k, port))._replace(source_port=port))
+    capture.write_bytes(pcap_of(*sorted(packets)))
+    document = json.loads(measure(capture, "--sequence-at", "0:2", "--flows", "--json").stdout)
+    assert [flow["effective_losses"] for flow in document["flows"]] == [100, 30, 0]
+    assert [flow["flow"] for flow in document["flows"]] == [3, 2, 1]  # numbered by their packets
+    # The same numbers as those of the flow alone.
+    alone = json.loads(measure(capture, "--sequence-at", "0:2", "--flow", "3", "--json").stdout)
+    assert (alone["effective_losses"], alone["M"]) == (100, document["flows"][0]["M"])
+    refused = measure(capture, "--flows")
+    assert refused.exit_code == 2
+    assert "no flow can be measured; flow 1: has one end only" in refused.output

@@ -185,8 +185,11 @@ def test_a_wrong_name_names_the_near_ones(name: str, message: str) -> None:
         (("is_guess", "is_gues"), "like FILE: FILE: is_gues = true: unknown key; did you mean is_guess?"),
     ],
 )
-def test_a_mistake_in_a_preset_is_one_line(tmp_path: Path, change: tuple[str, str], message: str) -> None:
-    path = tmp_path / "office.toml"
+def test_a_mistake_in_a_preset_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: tuple[str, str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path("office.toml")
     path.write_text(OWN.replace(*change))
     with pytest.raises(CallerError) as error:
         [settings_of(["like", str(path)], direction=direction) for direction in DIRECTIONS]
