@@ -14,11 +14,11 @@ from netem.core.command_line import stoppable_imports
 
 with stoppable_imports():
     from netem.core.command_line import Parser, report_failure, why_not_written
-    from netem.core.errors import ExitStatus, NoackError
+    from netem.core.errors import CallerError, ExitStatus, NoackError
     from netem.core.standard_streams import guard_streams
     from netem.core.system_processes import exhausted_limit
 
-COMMANDS = ("show", "set", "watch", "shell")
+COMMANDS = ("show", "set", "watch", "shell", "measure")
 """First words that are commands."""
 
 
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None, parser: Parser | None = None) -
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     command = words[0] if words and words[0] in COMMANDS else None
-    if command not in (None, "shell"):
+    if command not in (None, "shell", "measure"):
         from netem.control import emulator_commands  # the relay starts without it
 
         return emulator_commands.main(words)
@@ -43,6 +43,8 @@ def main(arguments: Sequence[str] | None = None, parser: Parser | None = None) -
 
             as_json = "--json" in words[: (*words, "--").index("--")]
             return run_in_shell(words[1:])
+        if command == "measure":
+            return _measure(words[1:])
         from netem.stand_alone import run_stand_alone
 
         status = run_stand_alone(words, parser)
@@ -54,6 +56,16 @@ def main(arguments: Sequence[str] | None = None, parser: Parser | None = None) -
     except OSError as error:
         reason = exhausted_limit(error) or why_not_written(error) or str(error)
         return report_failure(reason, ExitStatus.FAILED, source="noack netem", as_json=as_json)
+
+
+def _measure(words: Sequence[str]) -> ExitStatus:
+    try:
+        from netem.measurement.measure_command import measure  # the relay starts without it
+    except ModuleNotFoundError as error:
+        if error.name is None or not error.name.startswith("scipy"):
+            raise
+        raise CallerError("measure needs scipy: pip install 'noack-netem[measure]'") from None
+    return measure(words)
 
 
 def command() -> NoReturn:

@@ -7,7 +7,7 @@ from typing import Literal, TypeVar
 
 from cosim.api.scenarios import Source, load
 from cosim.measurement.certificate_time import CertificateTime, measured_certificate_time
-from cosim.measurement.measurement_outputs import measurement_document
+from cosim.measurement.measurement_outputs import outputs_document
 from cosim.measurement.network_section import write_network
 from cosim.measurement.run_trace import read_source
 from netem.core.file_access import require_suffix
@@ -52,7 +52,7 @@ class Measurement(NetworkMeasurement):
         from cosim.output.page_kit import save_page  # imports matplotlib
 
         require_suffix(Path(path), "--out", ".html")
-        save_page(measurement_document(self), Path(path))
+        save_page(outputs_document(self), Path(path))
 
     def write_network(self, path: str | PathLike[str], form: Literal["trace", "model"] = "trace") -> None:
         """Write a ``[network]`` section that reproduces the network (``.toml``).

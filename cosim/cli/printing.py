@@ -1,14 +1,13 @@
 """What commands print: the result as text or as JSON, tables in files, what is being done."""
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
-from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netem.core.command_line import print_to_stderr
 from netem.core.errors import ExitStatus
+from netem.output.json_writer import print_json as print_json
 
 if TYPE_CHECKING:
     from netem.core.console import SafeConsole
@@ -75,16 +74,3 @@ def print_lines(json: bool, document: object, *lines: object) -> None:
         print_json(document)
     else:
         print(*lines, sep="\n")
-
-
-def print_json(document: object) -> None:
-    """Print the document of ``--json``; a number that is not finite becomes null."""
-    print(dumps(_finite(document), indent=2, allow_nan=False))
-
-
-def _finite(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -164,6 +164,21 @@ def test_the_emulator_alone_says_what_predictions_need(netem: Installed) -> None
     assert "predictions need scipy: pip install 'noack-netem[measure]'" in kept.stderr
 
 
+def test_the_emulator_alone_says_what_measuring_needs(netem: Installed) -> None:
+    done = netem("measure", "urban_n78_40kmh")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "measure needs scipy: pip install 'noack-netem[measure]'" in done.stderr
+
+
+def test_the_emulator_with_measure_measures(measuring: Installed) -> None:
+    words = ("measure", "urban_n78_40kmh", "--deadline", "100ms", "--survival", "120ms")
+    document = measuring.json(*words)
+    assert document["effective_losses"] == 7
+    shown = measuring(*words)
+    assert shown.returncode == 0, shown.stderr
+    assert "urban_n78_40kmh: M = 5" in shown.stdout
+
+
 def test_the_emulator_with_measure_predicts(measuring: Installed) -> None:
     explained = measuring.json("--explain", "loss", "5%", "keep", "mansd", "4")
     assert "pip install" not in json.dumps(explained)

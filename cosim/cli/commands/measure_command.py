@@ -1,8 +1,5 @@
 """``noack measure``: losses, delays and the M of a real network."""
 
-import re
-from collections.abc import Mapping
-from decimal import Decimal
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -12,13 +9,11 @@ from typer import Argument, Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import MEASURING, examples
-from cosim.cli.printing import show
+from cosim.cli.printing import show, status
 from cosim.output.figures.figure_format import requested_files
 from netem.core.errors import CallerError
 
 app = typer.Typer()
-
-_RATE = re.compile(r"([0-9]+(?:\.[0-9]+)?)(k?)(?:hz)?", re.IGNORECASE)
 
 
 class NetworkForm(StrEnum):
@@ -180,18 +175,20 @@ def measure(
     from cosim.measurement.measurement_outputs import OutputRequest, write_outputs
     from cosim.measurement.run_trace import read_source
     from netem.measurement.loss_bursts import WINDOWS
+    from netem.measurement.measure_options import period_ns, refuse, time_s
+    from netem.measurement.measure_options import share as as_share
     from netem.measurement.measured_preset import preset_path
     from netem.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
     from netem.measurement.trace_sources import FILE_OPTIONS, SourceOptions, is_iperf3_file, refuse_unused
     from netem.traces.packet_trace import find_trace
 
     options = MeasurementOptions(
-        _time_s("--deadline", deadline),
-        tuple(map(_share, share or ())) or QUANTILES,
+        time_s("--deadline", deadline),
+        tuple(map(as_share, share or ())) or QUANTILES,
         window or WINDOWS,
-        _time_s("--outage", outage),
-        _time_s("--interval", interval),
-        _time_s("--survival", survival),
+        time_s("--outage", outage),
+        time_s("--interval", interval),
+        time_s("--survival", survival),
         within,
     )
     if settings and for_scenario is None:
@@ -203,22 +200,24 @@ def measure(
     figures = requested_files(figure_format, width)
     request = OutputRequest(out, figures, write, form.value, scenario, preset_file)
     differ = None if clocks is None else clocks is ClockRelation.DIFFERENT
-    reading = SourceOptions(differ, flow, far_flow, sequence_at, bits, numbers, _period_ns(rate))
+    reading = SourceOptions(differ, flow, far_flow, sequence_at, bits, numbers, period_ns(rate))
     paths = [*map(find_trace, sources)]
     single = {"--for": for_scenario, "--out": out, "--write": write, "--preset": preset}
     if len(paths) == 1 and is_iperf3_file(paths[0]):
-        from cosim.measurement.iperf3_table import iperf3_document
+        from netem.measurement.iperf3_table import iperf3_document
 
         needs_packets = {"--deadline": deadline, "--outage": outage, "--survival": survival, "--share": share}
-        _refuse(single | needs_packets | {"--window": window}, "needs packets; iperf3 counts per interval")
+        refuse(single | needs_packets | {"--window": window}, "needs packets; iperf3 counts per interval")
         refuse_unused(reading, FILE_OPTIONS, "a report of iperf3")
         show(iperf3_document(paths[0]), json=json)
         return
     if flows:
-        from cosim.measurement.flow_table import flows_document
+        from netem.measurement.flow_table import flows_document
 
-        _refuse(single, "is of one flow; give --flow N in place of --flows")
-        show(flows_document(paths, reading, options), json=json)
+        refuse(single, "is of one flow; give --flow N in place of --flows")
+        with status("measuring"):
+            document = flows_document(paths, reading, options)
+        show(document, json=json)
         return
     trace = read_source(paths, reading)
     measurement = NetworkMeasurement(trace, options, " ".join(sources), trace.notes)
@@ -226,41 +225,3 @@ def measure(
     show(document, json=json, written=[str(path) for path in written])
     if not json:
         print(*(f"written: {path}" for path in written), sep="\n", end="\n" * bool(written))
-
-
-def _refuse(given: Mapping[str, object], reason: str) -> None:
-    """Refuse the first option that has a value."""
-    for option, value in given.items():
-        if value is not None:
-            raise CallerError(f"{option}: {reason}")
-
-
-def _period_ns(rate: str) -> int:
-    """Return the period of a rate such as ``50hz`` or ``2khz``."""
-    from netem.measurement.trace_sources import probe_period_ns
-
-    match = _RATE.fullmatch(rate)
-    per_s = Decimal(match[1]) * (1000 if match[2] else 1) if match else Decimal(0)
-    if not per_s:
-        raise CallerError(f"--rate {rate}: expected a rate from 0.001hz to 20khz, e.g. 50hz")
-    return probe_period_ns(float(1 / per_s))
-
-
-def _time_s(option: str, text: str | None) -> float | None:
-    """Return a time such as ``60s``."""
-    from netem.impairments.words import OWN_TIME_S
-
-    if text is None:
-        return None
-    try:
-        return OWN_TIME_S.read(text)
-    except ValueError:
-        raise CallerError(f"{option} {text}: expected {OWN_TIME_S.expected}") from None
-
-
-def _share(text: str) -> float:
-    percent = text.endswith("%")
-    try:
-        return float(text.removesuffix("%")) / (100 if percent else 1)
-    except ValueError:
-        raise CallerError(f"--share {text}: expected a share, e.g. 0.99 or 99%") from None

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import noack
 from cosim.measurement.certificate_time import measured_certificate_time
-from cosim.measurement.measurement_outputs import measurement_figures, measurement_tables
+from cosim.measurement.measurement_outputs import measurement_figures, outputs_document
 from netem.measurement.network_measurement import (
     MeasurementOptions,
     NetworkMeasurement,
@@ -56,5 +56,5 @@ def test_any_trace_is_measured(records: list[tuple[int, int | None]], deadline_s
     void = measured_certificate_time(measurement, noack.load("lane_following"))
     assert 0 <= void.share <= 1
     assert all(cause.share <= void.share for cause in void.causes)
-    assert [*measurement_tables(measurement, void)]
+    assert outputs_document(measurement, void).tables
     assert len([*measurement_figures(measurement)]) == 4

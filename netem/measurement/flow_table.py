@@ -3,14 +3,13 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from cosim.live.monitoring.progress import activity
-from cosim.output.document import Document, Sentence, SentenceRole
-from cosim.output.result_tables import ResultTable
 from netem.core.errors import CallerError
 from netem.core.number_format import NONE, counted, duration, percent
 from netem.measurement.flow_comparison import FlowComparison, MeasuredFlow, compare_flows
 from netem.measurement.network_measurement import MeasurementOptions
 from netem.measurement.trace_sources import SourceOptions, read_flows
+from netem.output.document import Document, Sentence, SentenceRole
+from netem.output.result_tables import ResultTable
 
 _HEADS = (
     "flow",
@@ -31,9 +30,8 @@ def flows_document(paths: Sequence[Path], reading: SourceOptions, options: Measu
         NoackError: one line; a file cannot be read, or an option is wrong.
     """
     name = " ".join(map(str, paths))
-    with activity("measuring"):
-        compared = compare_flows(*read_flows(paths, reading), options)
-        rows = [_row(flow) for flow in compared.measured]
+    compared = compare_flows(*read_flows(paths, reading), options)
+    rows = [_row(flow) for flow in compared.measured]
     if not rows:
         reasons = "; ".join(f"flow {flow.number}: {flow.problem}" for flow in compared.not_measured[:1])
         raise CallerError(f"{name}: no flow can be measured; {reasons}")

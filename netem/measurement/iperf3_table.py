@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from cosim.output.document import Document, Sentence, SentenceRole
-from cosim.output.result_tables import KEY_VALUE, ResultTable
 from netem.core.number_format import duration, number, percent
 from netem.measurement.interval_losses import StreamLosses
+from netem.output.document import Document, Sentence, SentenceRole
+from netem.output.result_tables import KEY_VALUE, ResultTable
 from netem.traces.iperf3_report import read_iperf3
 
 _REMARK = (
