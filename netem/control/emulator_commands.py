@@ -95,14 +95,14 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     )
     require_no_dashes(arguments)
     options = parser.parse_intermixed_args(arguments)
-    options.name, settings = _name_and_settings(options.words)
-    settings = read_files(settings, Path())
+    options.name, words = _name_and_words(options.words)
+    directions = DIRECTIONS if options.direction == "both" else (options.direction,)
+    settings = {each: read_files(settings_of(words, direction=each), Path()) for each in directions}
     # Change the emulator, and show all settings afterwards.
     client = Client(_named_emulator(options))
     earlier = client.links()
-    table = settings.model_dump(mode="json")
-    directions = DIRECTIONS if options.direction == "both" else (options.direction,)
-    client.change(_link_name(options.link, earlier), **dict.fromkeys(directions, table))
+    tables = {each: settings[each].model_dump(mode="json") for each in directions}
+    client.change(_link_name(options.link, earlier), **tables)
     later = client.links()
     if options.json:
         print(json.dumps({"links": later}), flush=True)
@@ -140,21 +140,23 @@ def _warn_of_removed_caps(earlier: Sequence[Mapping[str, Any]], later: Sequence[
                 )
 
 
-def _name_and_settings(words: Sequence[str]) -> tuple[str | None, LinkSettings]:
-    """Separate the emulator's name, if the words begin with one, from the settings."""
+def _name_and_words(words: Sequence[str]) -> tuple[str | None, Sequence[str]]:
+    """Separate the emulator's name, if the words begin with one, from the words of settings."""
     name, setting_words = None, words
     if words and words[0] in running_emulators():
         name, setting_words = words[0], words[1:]
     if not setting_words:
         raise CallerError("words are missing, for example: loss 5% mansd 4; or: loss none")
     try:
-        return name, settings_of(setting_words)
+        settings_of(setting_words)
     except CallerError:
         if name is None:
             with suppress(CallerError):
                 # The rest is valid: the first word is the name of an emulator that does not run.
-                return words[0], settings_of(words[1:])
+                settings_of(words[1:])
+                return words[0], words[1:]
         raise
+    return name, setting_words
 
 
 def _watch(arguments: Sequence[str]) -> ExitStatus:
