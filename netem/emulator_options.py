@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from netem.core.address import parse_address, parse_destination
+from netem.core.clock import NS_PER_S
 from netem.core.command_line import Parser
 from netem.core.errors import CallerError
 from netem.core.number_checks import whole_number
@@ -16,7 +17,7 @@ from netem.impairments.burst_prediction import USUAL_PACKETS, read_within
 from netem.impairments.link_settings import LinkSettings
 from netem.impairments.target_loss import read_files
 from netem.impairments.words import OWN_TIME_S
-from netem.links_file import load_links, load_presets
+from netem.links_file import load_links, load_presets, load_timetable
 from netem.presets.preset import Preset, find_preset
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import (
@@ -28,6 +29,7 @@ from netem.tc_words import (
     reverse_words,
     settings_of,
 )
+from netem.timetable_file import SHORTEST_NS, TimetableFile, read_timetable
 
 LINK_NAME = "relay"
 """Name of the link that the command line describes."""
@@ -179,6 +181,13 @@ def _add_words(group: argparse._ArgumentGroup, side: str, peer: str) -> None:
     group.add_argument("words", nargs="*", metavar="WORDS", help=f"impairments, {side} to {peer}")
     group.add_argument("--reverse", metavar="WORDS", nargs="+", help=f"impairments, {peer} to {side} (none)")
     group.add_argument("--both", action="store_true", help="the words apply in both directions")
+    group.add_argument(
+        "--timetable",
+        metavar="FILE",
+        type=Path,
+        help="change the impairments at the times in this CSV file: time_s,words (direction, link)",
+    )
+    group.add_argument("--repeat", metavar="TIME", help="repeat the timetable after TIME")
     subject = "client that sends" if side == "clients" else "flow that has"
     group.add_argument("--idle", metavar="TIME", help=f"remove a {subject} nothing for TIME (60s)")
     group.add_argument("--seed", type=int, help="seed of the random streams (0)")
@@ -256,6 +265,27 @@ def presets_of(options: argparse.Namespace) -> tuple[Preset, ...]:
     return tuple(map(find_preset, dict.fromkeys(names)))
 
 
+def timetable_of(options: argparse.Namespace, specs: Sequence[LinkSpec]) -> TimetableFile | None:
+    """Return the timetable for the links of a command line, or of its file of links.
+
+    Raises:
+        CallerError: an option or the file has a mistake; one line for each.
+    """
+    links: Path | None = getattr(options, "links", None)
+    if options.timetable is None:
+        if options.repeat is not None:
+            raise CallerError(f"--repeat {options.repeat}: is for --timetable FILE")
+        return None if links is None else load_timetable(links, specs)
+    if links is not None and load_timetable(links, specs) is not None:
+        raise CallerError(f"--timetable {options.timetable}: {links} has a timetable already")
+    repeat_ns = None
+    if options.repeat is not None:
+        repeat_ns = round(_time_s("--repeat", options.repeat) * NS_PER_S)
+        if repeat_ns < SHORTEST_NS:
+            raise CallerError(f"--repeat {options.repeat}: must be 1ms or more")
+    return read_timetable(options.timetable, specs, repeat_ns)
+
+
 def explained_packets(options: argparse.Namespace) -> int:
     """Return how many packets the explanation's chance of a long loss burst is for.
 
@@ -265,14 +295,7 @@ def explained_packets(options: argparse.Namespace) -> int:
     for name in ("within", "period"):
         if getattr(options, name) is not None and not options.explain:
             raise CallerError(f"--{name}: is for --explain")
-    period_s = None
-    if options.period is not None:
-        try:
-            period_s = OWN_TIME_S.read(options.period)
-        except ValueError:
-            raise CallerError(f"--period {options.period}: expected {OWN_TIME_S.expected}") from None
-        if period_s <= 0:
-            raise CallerError(f"--period {options.period}: must be more than 0")
+    period_s = None if options.period is None else _time_s("--period", options.period)
     if options.within is None:
         return USUAL_PACKETS
     try:
@@ -291,15 +314,20 @@ def _require_word(words: Sequence[str]) -> None:
 
 
 def _idle_s(text: str | None) -> float:
-    if text is None:
-        return LinkSpec.idle_s
+    return LinkSpec.idle_s if text is None else _time_s("--idle", text)
+
+
+def _time_s(option: str, text: str) -> float:
+    """Return the time of an option; raise CallerError if it is none, or out of range."""
     try:
-        idle_s = OWN_TIME_S.read(text)
+        time_s = OWN_TIME_S.read(text)
     except ValueError:
-        raise CallerError(f"--idle {text}: expected {OWN_TIME_S.expected}") from None
-    if not 0 < idle_s <= 1e6:
-        raise CallerError(f"--idle {text}: must be more than 0")
-    return idle_s
+        raise CallerError(f"{option} {text}: expected {OWN_TIME_S.expected}") from None
+    if time_s <= 0:
+        raise CallerError(f"{option} {text}: must be more than 0")
+    if time_s > 1e6:
+        raise CallerError(f"{option} {text}: must be 1000000s or less")
+    return time_s
 
 
 def _directions(options: argparse.Namespace) -> tuple[LinkSettings, LinkSettings, int]:

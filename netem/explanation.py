@@ -3,6 +3,7 @@
 import json
 import textwrap
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 import tomli_w
@@ -12,8 +13,10 @@ from rich.table import Table
 from rich.text import Text
 
 from netem.core.address import address_text
+from netem.core.clock import NS_PER_S
 from netem.core.console import SafeConsole
 from netem.core.errors import shortened
+from netem.core.number_format import counted
 from netem.impairments.burst_prediction import BurstPrediction, caps_with, chance_text, predict_bursts
 from netem.impairments.feature import Impairment
 from netem.impairments.link_settings import LinkSettings
@@ -25,9 +28,12 @@ from netem.presets.preset import Preset
 from netem.presets.preset_text import print_explanation
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import words_of
+from netem.timetable_file import TimetableFile
 
 _MAX_TOML = 4000
 """Longest settings that are printed, in characters."""
+_MOST_LINES = 50
+"""Lines of a timetable that are printed."""
 _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 """Minimum and maximum columns for words."""
 
@@ -36,6 +42,7 @@ def explain(
     specs: Sequence[LinkSpec],
     as_written: Sequence[LinkSpec],
     presets: Sequence[Preset] = (),
+    timetable: TimetableFile | None = None,
     *,
     as_json: bool,
     as_file: bool,
@@ -47,6 +54,7 @@ def explain(
         specs: the links.
         as_written: the same links, with the names of files instead of their content: what tables show.
         presets: the presets that the words name.
+        timetable: the changes of settings.
         as_json: JSON, with the content.
         as_file: tables have the links as a file of links instead of their names.
         packets: how many packets the chance of a long loss burst is for.
@@ -64,7 +72,8 @@ def explain(
             for spec in specs
         ]
         named = {"presets": [preset.content() for preset in presets]} if presets else {}
-        print(json.dumps(named | {"links": links}))
+        timed = {} if timetable is None else {"timetable": _timetable_document(timetable)}
+        print(json.dumps(named | {"links": links} | timed))
         return
     console = SafeConsole(highlight=False)
     for preset in presets:
@@ -77,6 +86,8 @@ def explain(
             addresses = f"{address_text(spec.listen)} → {address_text(spec.to)}"
             console.print(Text(f"{spec.name}: {addresses}{seed}", "bold underline"))
         _print_link(console, spec, written_spec, packets)
+        if number == len(specs) - 1 and timetable is not None:
+            _print_timetable(console, timetable, specs)
         if as_file:
             console.print(Text("\nas a file of links (--links)", "bold"))
             toml = tomli_w.dumps({"link": [_link_table(written_spec)]}).strip()
@@ -101,6 +112,51 @@ def _document(settings: LinkSettings, packets: int) -> dict[str, object]:
         "tc_lacks": list(tc.lacks),
         "tc_notes": list(tc.notes),
     }
+
+
+def _timetable_document(timetable: TimetableFile) -> dict[str, object]:
+    repeat_ns = timetable.repeat_ns
+    changes = [
+        {
+            "time_s": change.at_ns / NS_PER_S,
+            "link": change.link,
+            "direction": change.direction,
+            "words": words_of(change.settings),
+            "predicted_loss": expected_loss(change.settings).rate,
+        }
+        for change in timetable.timetable.changes
+    ]
+    return {
+        "file": str(timetable.path),
+        "repeat_s": None if repeat_ns is None else repeat_ns / NS_PER_S,
+        "changes": changes,
+    }
+
+
+def _print_timetable(console: Console, timetable: TimetableFile, specs: Sequence[LinkSpec]) -> None:
+    console.print(Text(f"\ntimetable {timetable.path}: {timetable.summary}", "bold"))
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="dim")
+    table.add_column("time", justify="right")
+    if len(specs) > 1:
+        table.add_column("link")
+    table.add_column("direction")
+    table.add_column("words", overflow="fold", style="bold")
+    table.add_column("expected loss rate")
+    for line in timetable.lines[:_MOST_LINES]:
+        first = line.changes[0]
+        rate = expected_loss(first.settings).rate
+        table.add_row(
+            f"{first.at_ns / NS_PER_S:g} s",
+            *([first.link] if len(specs) > 1 else []),
+            first.direction if len(line.changes) == 1 else "both",
+            Text(shortened(line.words, 200)),
+            "not known" if rate is None else f"{100 * rate:.4g}%",
+        )
+    console.print(table)
+    if (more := len(timetable.lines) - _MOST_LINES) > 0:
+        console.print(Text(f"and {counted(more, 'further line')}; --json has all"))
+    for note in islice(timetable.notes(specs), 1):
+        console.print(Text(note))
 
 
 def settings_meaning(settings: LinkSettings) -> Iterator[tuple[str, str]]:

@@ -1,5 +1,6 @@
 """The file of links: several links of one relay, as TOML; see :class:`LinksFile`."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Self
@@ -9,6 +10,7 @@ from pydantic_core import to_json
 
 from netem.core import toml_file
 from netem.core.address import parse_address, parse_destination
+from netem.core.clock import NS_PER_S
 from netem.core.errors import CallerError
 from netem.core.settings_section import FolderName, ReadTable, ScenarioSection, Seed, Table
 from netem.impairments.link_settings import LinkSettings
@@ -16,6 +18,7 @@ from netem.impairments.target_loss import read_files
 from netem.presets.preset import Direction, Preset, find_preset
 from netem.relay.relay_links import STREAM, LinkSpec
 from netem.tc_words import preset_names, reverse_words, settings_of
+from netem.timetable_file import SHORTEST_NS, TimetableFile, read_timetable
 
 
 def _settings(value: object, info: ValidationInfo) -> LinkSettings:
@@ -117,6 +120,10 @@ class LinksFile(ScenarioSection):
 
     link: Annotated[tuple[LinkTable, ...], Field(min_length=1)]
     """The links, [[link]] each."""
+    timetable: Annotated[str, Field(min_length=1)] | None = None
+    """A CSV file with changes of settings: when, which link, and words."""
+    timetable_repeat_s: Annotated[FiniteFloat, Field(ge=SHORTEST_NS / NS_PER_S, le=1e6)] | None = None
+    """The timetable repeats after this time, in seconds."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -125,6 +132,8 @@ class LinksFile(ScenarioSection):
             if link.name in names:
                 raise ValueError(f"link.{number}.name: another link has this name already")
             names.add(link.name)
+        if self.timetable_repeat_s is not None and self.timetable is None:
+            raise ValueError('timetable_repeat_s: there is no timetable; add timetable = "FILE.csv"')
         return self
 
 
@@ -152,6 +161,20 @@ def load_links(path: Path, *, read: bool = True) -> tuple[LinkSpec, ...]:
             )
         listening[spec.listen] = spec.name
     return specs
+
+
+def load_timetable(path: Path, specs: Sequence[LinkSpec]) -> TimetableFile | None:
+    """Read the timetable that a file of links names, which has been read without a mistake.
+
+    Raises:
+        CallerError: as :func:`netem.timetable_file.read_timetable`.
+    """
+    content = toml_file.read(path, LinksFile)
+    name, repeat_s = content.get("timetable"), content.get("timetable_repeat_s")
+    if not isinstance(name, str):
+        return None
+    repeat_ns = round(repeat_s * NS_PER_S) if isinstance(repeat_s, int | float) else None
+    return read_timetable(path.parent / name, specs, repeat_ns)
 
 
 def load_presets(path: Path) -> tuple[Preset, ...]:

@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
@@ -20,7 +21,14 @@ from netem.core.command_line import Parser, Signals, log_event, log_format, repo
 from netem.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from netem.core.number_format import counted
 from netem.core.realtime_settings import realtime
-from netem.emulator_options import command_line_parser, explained_packets, parse_options, presets_of, specs_of
+from netem.emulator_options import (
+    command_line_parser,
+    explained_packets,
+    parse_options,
+    presets_of,
+    specs_of,
+    timetable_of,
+)
 from netem.explanation import explain
 from netem.presets.preset import shipped_presets
 from netem.presets.preset_text import print_list
@@ -28,7 +36,9 @@ from netem.relay.link_sockets import raise_file_limit
 from netem.relay.relay import Relay
 from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.relay.relay_reports import report_line
+from netem.relay.timetable import Timetable
 from netem.relay_watch import add_watching_options, check_watching_options, watch_relay
+from netem.timetable_file import TimetableFile
 
 _FIFO_PRIORITY = 50
 """As the controller of a run has it by default."""
@@ -81,6 +91,7 @@ def run_stand_alone(arguments: Sequence[str], parser: Parser | None = None) -> E
         print_list(shipped_presets().values(), as_json=options.json)
         return ExitStatus.OK
     specs = specs_of(options)
+    timetable = timetable_of(options, specs)
     packets = explained_packets(options)
     if options.explain:
         specs_as_written = specs_of(options, read=False)
@@ -88,6 +99,7 @@ def run_stand_alone(arguments: Sequence[str], parser: Parser | None = None) -> E
             specs,
             specs_as_written,
             presets_of(options),
+            timetable,
             as_json=options.json,
             as_file=options.links is None,
             packets=packets,
@@ -95,7 +107,7 @@ def run_stand_alone(arguments: Sequence[str], parser: Parser | None = None) -> E
         return ExitStatus.OK
     with log_format(options.log_format):
         try:
-            totals = run_relay(specs, options)
+            totals = run_relay(specs, options, timetable=timetable)
         except NoackError as error:  # reported in the format of the log
             return report_failure(str(error), error.exit_status, source="noack netem", as_json=options.json)
         report_totals(totals, options)
@@ -117,11 +129,18 @@ def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
 
 
 def run_relay(
-    specs: Sequence[LinkSpec], options: argparse.Namespace, program: RelayedProgram | None = None
+    specs: Sequence[LinkSpec],
+    options: argparse.Namespace,
+    program: RelayedProgram | None = None,
+    timetable: TimetableFile | None = None,
 ) -> Statistics:
     """Relay until Ctrl-C, or the program's end; return the totals.
 
-    ``options`` are those of :func:`add_relay_options`.
+    Args:
+        specs: the links.
+        options: those of :func:`add_relay_options`.
+        program: what the relay serves, if it is a shell.
+        timetable: the changes of settings.
 
     Raises:
         CallerError: an address is in use, or a file cannot be written.
@@ -132,7 +151,9 @@ def run_relay(
     with ExitStack() as signal_stack, ExitStack() as stack:
         # Open the relay, and what watches it.
         with starting(options.control):
-            relay = _open_relay(specs, options, None if program is None else program.devices)
+            changes = None if timetable is None else timetable.timetable
+            devices = None if program is None else program.devices
+            relay = _open_relay(specs, options, devices, changes)
             stack.callback(relay.close)
             signals = signal_stack.enter_context(Signals().handled())
             commands, control = stack.enter_context(watch_relay(relay, options))
@@ -144,6 +165,10 @@ def run_relay(
                 report_line(f"{setting} {answer}")
         for line in () if control is None else control.lines():
             report_line(line)
+        if timetable is not None:
+            report_line(f"{timetable.path}: {timetable.summary}")
+            for note in islice(timetable.notes(specs), 1):
+                report_line(note)
         takes_output = options.stats is not None and options.stats_file is None
         if program is None:
             addresses = {} if control is None else {"control": control.document()}
@@ -152,11 +177,16 @@ def run_relay(
         return statistics(commands.snapshot_here())
 
 
-def _open_relay(specs: Sequence[LinkSpec], options: argparse.Namespace, devices: DeviceLink | None) -> Relay:
+def _open_relay(
+    specs: Sequence[LinkSpec],
+    options: argparse.Namespace,
+    devices: DeviceLink | None,
+    timetable: Timetable | None,
+) -> Relay:
     raise_file_limit()
     spin_ns = _SPIN_NS if options.realtime else 0
     try:
-        return Relay(specs, segment=options.segment, spin_ns=spin_ns, devices=devices)
+        return Relay(specs, segment=options.segment, spin_ns=spin_ns, devices=devices, timetable=timetable)
     except OSError as error:  # no IPv6, or too many open files
         raise MachineError(f"the sockets of the links cannot be opened: {why(error)}") from None
 
@@ -168,10 +198,11 @@ def check_options(options: argparse.Namespace) -> None:
         CallerError: two options contradict each other.
     """
     check_watching_options(options)
-    links: Path | None = getattr(options, "links", None)
     stats: Path | None = options.stats_file
-    if links is not None and stats is not None and links.resolve() == stats.resolve():
-        raise CallerError(f"--stats-file {stats}: --links has the same file; choose another")
+    for name in ("links", "timetable"):
+        read: Path | None = getattr(options, name, None)
+        if read is not None and stats is not None and read.resolve() == stats.resolve():
+            raise CallerError(f"--stats-file {stats}: --{name} has the same file; choose another")
 
 
 def _report_ready(relay: Relay, control: Mapping[str, object], *, print_it: bool, as_json: bool) -> None:

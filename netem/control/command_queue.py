@@ -19,6 +19,7 @@ from netem.impairments.markov_chain import NotPredictableError
 from netem.impairments.target_loss import expected_loss, loss_process
 from netem.relay.relay import Relay
 from netem.relay.relay_reports import DIRECTIONS, Direction, LinkReport
+from netem.relay.timetable import TimedChange
 from netem.tc_words import words_of
 
 T = TypeVar("T")
@@ -76,8 +77,12 @@ class CommandQueue:
             for spec in relay.specs
             for direction in DIRECTIONS
         }
+        relay.on_timed_change = self._note_timed_change
         self._closed = False
         self._lock = Lock()
+
+    def _note_timed_change(self, change: TimedChange, counters: Counters) -> None:
+        self._applied[change.link, change.direction] = AppliedSettings(change.settings, counters)
 
     @property
     def links(self) -> Sequence[str]:

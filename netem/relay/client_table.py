@@ -184,7 +184,7 @@ class ClientTable:
 
     def _set_path(self, row: int, path: Endpoint) -> None:
         memory = self._memory
-        if self._directions[2 * memory.core.clients[row].link + 1].can_reorder:
+        if self._directions[2 * memory.core.clients[row].link + 1].needs_arrivals:
             stamp_arrivals(path)
         self._paths[row] = path
         self._without_path.discard(row)

@@ -10,18 +10,22 @@ import numpy as np
 from netem.core.address import Address
 from netem.core.core_library import core, ffi
 from netem.core.errors import CallerError
-from netem.impairments.link_settings import LinkSettings
+from netem.impairments.link_settings import Counters, LinkSettings
 from netem.relay.client_table import ClientTable
 from netem.relay.link_sockets import set_receive_timeout, stamp_arrivals
 from netem.relay.loss_warnings import LinkWarnings, UnintendedLosses
 from netem.relay.relay_links import DeviceLink, LinkSpec, OpenLink, open_links
 from netem.relay.relay_memory import RelayDirection, RelayMemory
 from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport
+from netem.relay.timetable import TimedChange, Timetable, TimetableProgress
 
 _PERIOD_NS = 40_000_000
 """Time between two turns of housekeeping."""
 _CHECK_PERIOD_NS = 250_000_000
 """Time between two checks for losses, idle clients and return paths."""
+_UNREAD_NS = 100_000_000
+"""A datagram that arrived so long ago, and before the last turn, has been read: a timed change applies
+although none has come since."""
 _REPORTED_FLOWS = 16
 """Flows of a direction that a report lists: those with most packets."""
 _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
@@ -39,6 +43,7 @@ class Relay:
         spin_ns: busy-wait instead of sleeping for this time before a delayed datagram is due, to
             avoid the delay of a wake-up.
         devices: those of a shell, in the place of sockets; its link is the only one.
+        timetable: changes of settings; a datagram meets those that apply at its arrival.
 
     Raises:
         CallerError: a socket cannot be bound, or a link is invalid.
@@ -51,7 +56,11 @@ class Relay:
         segment: bool = False,
         spin_ns: int = 0,
         devices: DeviceLink | None = None,
+        timetable: Timetable | None = None,
     ) -> None:
+        self._timetable = TimetableProgress(timetable or Timetable())
+        self.on_timed_change: Callable[[TimedChange, Counters], None] = lambda change, counters: None
+        """Called after each change of the timetable with the counts until then."""
         self.specs: Sequence[LinkSpec] = tuple(specs)
         # The sockets of the links, or the two devices of a shell.
         self._open_links: Sequence[OpenLink | DeviceLink] = (
@@ -76,7 +85,8 @@ class Relay:
         for number in range(len(self.specs)):
             self._listen(number)
         self._clients = ClientTable(self._open_links, self._warnings, self._directions, self._memory)
-        for number in range(len(self._directions)):
+        for number, direction in enumerate(self._directions):
+            direction.is_timed = timetable is not None
             self._stamp_arrivals(number)
 
     def addresses(self) -> Mapping[str, Address]:
@@ -99,10 +109,13 @@ class Relay:
     def _run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
         if self._epoch_ns == 0:
             self._epoch_ns = time.monotonic_ns()
+        read_ns = 0
         while not stop():
             housekeeping()
             now_ns = self._now_ns()
+            self._apply_due(max(min(read_ns, now_ns - _UNREAD_NS), 0))
             self._do_housekeeping(now_ns)
+            read_ns = now_ns
             self._relay_until(now_ns + _PERIOD_NS)
         self._end()
 
@@ -115,13 +128,24 @@ class Relay:
         Raises:
             CallerError: there is no such link.
         """
-        names = [spec.name for spec in self.specs]
-        if link not in names:
-            raise CallerError(f"link {link}: no such link; links: {', '.join(names)}")
-        number = 2 * names.index(link) + DIRECTIONS.index(direction)
+        number = self._number_of(link, direction)
         changed = self._directions[number]
         changed.change(settings, self._memory.latest_ns(number, changed.rows))
         self._stamp_arrivals(number)
+
+    def _apply_due(self, now_ns: int) -> None:
+        """Apply the changes of the timetable until a time, at which the core asks for the next."""
+        for change in self._timetable.take(now_ns):
+            self.change(change.link, change.direction, change.settings)
+            number = self._number_of(change.link, change.direction)
+            self.on_timed_change(change, self._directions[number].counters)
+        self._memory.core.change_ns = self._timetable.next_ns
+
+    def _number_of(self, link: str, direction: Direction) -> int:
+        names = [spec.name for spec in self.specs]
+        if link not in names:
+            raise CallerError(f"link {link}: no such link; links: {', '.join(names)}")
+        return 2 * names.index(link) + DIRECTIONS.index(direction)
 
     def report(self) -> Sequence[LinkReport]:
         """Return the counts so far."""
@@ -174,6 +198,8 @@ class Relay:
                 receiver = core.noack_relay_receiver(relay)
                 outside = bool(relay.devices) and receiver > 0
                 self._clients.add(receiver % len(self.specs), name, from_outside=outside)
+            elif reason == core.NOACK_CHANGE_DUE:
+                self._apply_due(relay.now_ns)
 
     def _do_housekeeping(self, now_ns: int) -> None:
         """Remove idle clients, open return paths again, check for losses."""
@@ -252,9 +278,9 @@ class Relay:
         reverse.set_server(link.server, core.NOACK_CLIENT_NAME)
 
     def _stamp_arrivals(self, direction: int) -> None:
-        """Enable arrival timestamps where datagrams are delayed: delays count from the arrival."""
+        """Enable arrival timestamps where delays and timed changes count from the arrival."""
         link = self._open_links[direction // 2]
-        if self._directions[direction].can_reorder and not isinstance(link, DeviceLink):
+        if self._directions[direction].needs_arrivals and not isinstance(link, DeviceLink):
             core.noack_relay_read_stamps(self._memory.core)
             if direction % 2 == 0:
                 stamp_arrivals(link.endpoint)

@@ -112,6 +112,8 @@ class RelayDirection(LinkState):
     ) -> None:
         super().__init__(settings, seed, *name, rows=_ROWS)
         self.row = row
+        self.is_timed = False
+        """Whether its settings change at given times."""
         row.link = self.core
         self._set_keeps()
 
@@ -128,6 +130,11 @@ class RelayDirection(LinkState):
     def counts_of(self, name: str) -> Integers:
         """Return a copy of ``delays``, ``lateness`` or ``errors`` of its ``noack_direction``."""
         return np.frombuffer(ffi.buffer(getattr(self.row, name)), np.int64).copy()
+
+    @property
+    def needs_arrivals(self) -> bool:
+        """Whether it matters when exactly a datagram has arrived."""
+        return self.can_reorder or self.is_timed
 
     @property
     def has_errors(self) -> bool:

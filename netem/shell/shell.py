@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from netem.core.command_line import Signals, log_format
 from netem.core.errors import CallerError, ExitStatus
 from netem.core.system_processes import python_command
-from netem.emulator_options import parse_options, shell_parser, shell_spec
+from netem.emulator_options import parse_options, shell_parser, shell_spec, timetable_of
 from netem.relay.relay_links import DeviceLink
 from netem.relay.relay_reports import report_line
 from netem.shell import process
@@ -40,6 +40,7 @@ def run_in_shell(arguments: Sequence[str]) -> int:
     add_relay_options(parser, shell=True)
     options = parse_options(parser, words)
     spec = shell_spec(options)
+    timetable = timetable_of(options, [spec])
     check_options(options)
     command = command or [os.environ.get("SHELL") or "/bin/sh"]
     outside = [_split(text) for text in options.outside or ()]
@@ -48,7 +49,7 @@ def run_in_shell(arguments: Sequence[str]) -> int:
             raise CallerError(f"{argv[0]}: there is no such program")
     with log_format(options.log_format):
         program = _Program(open_devices(spec), command, outside)
-        totals = run_relay([program.devices.spec], options, program)
+        totals = run_relay([program.devices.spec], options, program, timetable)
         report_totals(totals, options)
     return program.status
 

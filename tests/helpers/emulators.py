@@ -42,7 +42,7 @@ class Emulator:
         assert status == 0, stderr
         for line in stderr.splitlines():
             # A program may end with datagrams to it in flight.
-            usual = ("Ctrl-C ends", "ICMP port unreachable", "netem: control: ")
+            usual = ("Ctrl-C ends", "ICMP port unreachable", "netem: control: ", "of settings, ")
             assert any(words in line for words in usual), stderr
         return link
 

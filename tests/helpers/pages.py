@@ -42,6 +42,8 @@ def fill(folder: Path) -> Path:
     links, office = blocks("docs/netem.md", "toml")
     (folder / "links.toml").write_text(links)
     (folder / "office.toml").write_text(office)
+    (timetable,) = blocks("docs/netem.md", "csv")
+    (folder / "tunnel.csv").write_text(timetable)
     for code in [*blocks("docs/plants.md", "python"), *blocks("docs/plants.md", "toml")]:
         if (named := re.match(r"# (\w+\.(?:py|toml))\n", code)) is not None:
             (folder / named[1]).write_text(code)

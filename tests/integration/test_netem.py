@@ -17,7 +17,7 @@ from netem.control.running_emulators import running_emulators
 from netem.core.errors import ExitStatus
 from netem.relay.relay import Relay
 from tests.helpers.emulators import Emulate
-from tests.netem.relay.relays import HOSTS, endpoints, link, name_of
+from tests.netem.relay.relays import HOSTS, drain, endpoints, link, name_of
 
 pytestmark = pytest.mark.live
 
@@ -60,6 +60,29 @@ def test_several_links_are_relayed_and_counted(tmp_path: Path) -> None:
     newest = json.loads(lines.read_text().splitlines()[-1])["links"]
     assert [link["name"] for link in newest] == ["first", "second"]
     assert [link["forward"]["received"] for link in newest] == [2, 1]
+
+
+def test_a_timetable_changes_a_running_emulator_again_and_again(emulate: Emulate, tmp_path: Path) -> None:
+    """All is lost in every second 0.2 s."""
+    (tmp_path / "tunnel.csv").write_text("time_s,words\n0,loss none\n0.2,loss 100%\n")
+    with endpoints(*["127.0.0.1"] * 2) as (server, client):
+        words = "--timetable", str(tmp_path / "tunnel.csv"), "--repeat", "400ms"
+        emulator = emulate("{}:{}".format(*server.getsockname()), *words)
+        passed, number, late_s = [0], 0, time.monotonic() + 60
+        while len(passed) < 3 and time.monotonic() < late_s:  # runs of lost datagrams
+            number += 1
+            client.sendto(number.to_bytes(4, "big"), (emulator.host, emulator.port))
+            time.sleep(0.002)
+            for data, _ in drain(server):
+                received = int.from_bytes(data, "big")
+                if received - passed[-1] > 10:
+                    passed.append(received)
+                passed[-1] = received
+        statistics = emulator.finish()["forward"]
+    assert len(passed) == 3
+    assert statistics["received_before"] > 0
+    assert statistics["words"] in ("loss none", "loss 100%")
+    assert statistics["fates"]["dropped"] >= 20
 
 
 def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:

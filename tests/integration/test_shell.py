@@ -95,6 +95,24 @@ def test_the_ends_miss_the_bursts_that_the_emulator_counts(tmp_path: Path) -> No
     assert any("udp fragments " in flow["client"] for flow in totals.link["forward"]["flows"])
 
 
+def test_a_shell_follows_a_timetable(tmp_path: Path) -> None:
+    """Nothing passes before 0.5 s; the client asks until it has all its answers."""
+    need("ping")
+    (tmp_path / "tunnel.csv").write_text(
+        "time_s,direction,words\n0,both,loss 100%\n0.5,both,loss none\n1000,,loss 5%\n"
+    )
+    script = "for k in $(seq 60); do ping -c 1 -W 1 198.18.16.1 > /dev/null && exit 0; done; exit 1"
+    files = ["--timetable", str(tmp_path / "tunnel.csv"), "--json"]
+    done = run(*files, "--", "sh", "-c", script)
+    assert done.returncode == 0, done.stderr
+    assert f"{tmp_path}/tunnel.csv: 5 changes of settings, the last at 1000 s" in done.stderr
+    forward = json.loads(done.stdout)["links"][0]["forward"]
+    assert forward["words"] == "loss none"
+    wrong = run("--timetable", str(tmp_path / "tunnel.csv"), "--repeat", "1s", "--", "true")
+    assert wrong.returncode == 2
+    assert "line 4: time_s is 1000, but the timetable repeats every 1 s" in wrong.stderr
+
+
 def test_changed_settings_do_not_reset_the_memory_of_a_flow(tmp_path: Path) -> None:
     name = f"shell-{os.getpid()}"
     words = ["loss", "100%", "mansd", "4", "--control", name]
