@@ -42,7 +42,7 @@ def fill(folder: Path) -> Path:
     links, office = blocks("docs/netem.md", "toml")
     (folder / "links.toml").write_text(links)
     (folder / "office.toml").write_text(office)
-    (timetable,) = blocks("docs/netem.md", "csv")
+    (timetable,) = (text for text in blocks("docs/netem.md", "text") if text.startswith("time_s,"))
     (folder / "tunnel.csv").write_text(timetable)
     for code in [*blocks("docs/plants.md", "python"), *blocks("docs/plants.md", "toml")]:
         if (named := re.match(r"# (\w+\.(?:py|toml))\n", code)) is not None:
