@@ -193,11 +193,20 @@ def _opportunities(of: Chances, loops: int, horizon_s: float) -> Table:
 
 def _rate(of: Chances, loops: int, horizon_s: float) -> Table:
     table: Table = {"kind": "rate", "rate_bps": int(of.size(2e5, 1e7))}
-    of.put(table, 0.4, "queue", lambda: of.integer(2, 30))
+    limit = of.one_of("queue", "queue_bytes", "queue_s")
+    sizes = {
+        "queue": of.integer(2, 30),
+        "queue_bytes": of.integer(300, 20_000),
+        "queue_s": of.size(0.01, 0.2),
+    }
+    of.put(table, 0.5, limit, lambda: sizes[limit])
+    of.put(table, 0.3, "burst_bytes", lambda: of.integer(300, 20_000))
     of.put(table, 0.3, "overhead_bytes", lambda: of.integer(-20, 60))
     if of.chance(0.2):
         table |= {"cell_bytes": of.integer(20, 60), "cell_overhead_bytes": of.integer(0, 10)}
     of.put(table, 0.6, "discipline", lambda: _discipline(of, loops))
+    if table.get("discipline", {}).get("kind") in ("earliest_deadline", "maximum_error", "priority"):
+        table.pop("burst_bytes", None)
     return table
 
 
