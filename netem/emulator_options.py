@@ -63,7 +63,7 @@ settings, at any place:
   limit N    at most N datagrams are delayed at a time
   seed N     seed of the link's random streams
 
-  like NAME  the words of a preset, in each direction those that it has for it, e.g.
+  like NAME  the words of a preset, which may differ between the directions, e.g.
              like dsl mansd 4; or of a file: like ./NAME.toml
 
 A flow is the datagrams from one client (address and port), or the answers to it.

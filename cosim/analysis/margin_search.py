@@ -253,13 +253,12 @@ class MarginResult:
     def verdict(self) -> str:
         """The margin in words."""
         stable_m = self.stable_m
+        stable = "proven stable" if self._verified_m >= (stable_m or 0) else "stable"
         parts = []
         if stable_m == self.caps[-1].m and self.every_m:
-            parts = [
-                f"proven stable for every loss pattern that the constraints allow, with every M ≥ {stable_m}"
-            ]
+            parts = [f"{stable} for every loss pattern that the constraints allow, with every M ≥ {stable_m}"]
         elif stable_m is not None:
-            parts = [f"proven stable for every loss pattern with M ≤ {stable_m}"]
+            parts = [f"{stable} for every loss pattern with M ≤ {stable_m}"]
         parts += [
             f"{guarantee.meaning}: undecided, {undecided_text(guarantee.stability)}"
             for guarantee in self.compared.guarantees
@@ -294,14 +293,18 @@ class MarginResult:
         return [text for text in (self.unverified_text, self.ties, self.late_inputs) if text]
 
     @property
+    def _verified_m(self) -> int:
+        """The largest M whose stability noack-check has verified; 0 if there is none."""
+        caps = () if self.proof is None else self.caps
+        return max((cap.m for cap in caps if "most" in cap.stability.entries), default=0)
+
+    @property
     def unverified_text(self) -> str:
         """What of the verdict noack-check has not verified, as a sentence; empty if it has verified all."""
-        known = () if self.proof is None else self.caps
-        proven_m = max((cap.m for cap in known if "most" in cap.stability.entries), default=0)
         last, whats = self.destabilised, list[str]()
-        if proven_m < (self.stable_m or 0):
+        if self._verified_m < (self.stable_m or 0):
             whats.append(f"that M = {self.stable_m} is stable")
-        if last is not None and not (known and "least" in last.stability.entries):
+        if last is not None and (self.proof is None or "least" not in last.stability.entries):
             whats.append(f"that M = {last.m} is destabilised")
         if not whats:
             return ""

@@ -109,7 +109,7 @@ class EchoRecords:
             )
         numbers, rtt_ns, printed_ns = map(np.array, (self._numbers, self._rtt_ns, self._printed_ns))
         everything = np.arange(first, first + count)
-        notes = ["delays are those of round trips"]
+        notes = ["the delays are round-trip times"]
         if len(numbers) > 1 and (printed_ns >= 0).all() and np.ptp(numbers):
             order = np.argsort(numbers)
             known_ns = np.maximum.accumulate((printed_ns - rtt_ns)[order])

@@ -54,7 +54,7 @@ def read_irtt(file: IO[bytes], most_packets: int) -> PacketTrace:
     except TraceRecordError as error:
         raise ValueError(f"round trip {error.row + 1}: {error}") from None
     notes = [f"lost {_WAYS[way]}: {ways[way]}" for way in _WAYS if ways[way]]
-    return trace.noted("delays are those of round trips", *notes)
+    return trace.noted("the delays are round-trip times", *notes)
 
 
 def _texts(file: IO[bytes]) -> Iterator[str]:

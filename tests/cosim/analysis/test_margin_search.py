@@ -82,6 +82,8 @@ def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:
     text = "that M = 2 is stable: computed by noack with error bounds, not verified by noack-check"
     assert unverified.unverified_text == text
     assert text in repr(unverified)
+    assert margin.verdict.startswith("proven stable for every loss pattern")
+    assert unverified.verdict.startswith("stable for every loss pattern")
     with pytest.raises(noack.NoackError, match="most 0: expected at least 1"):
         noack.margin("lane_periodic", most_m=0)
 
