@@ -34,7 +34,10 @@ def test_one_of_each_command_runs(
 def test_the_way_of_the_readme_leads_from_a_plant_to_a_live_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its three commands, in their order: two begin with its first sentence, the third with the second."""
+    """Its three commands, in their order: two begin with its first sentence, the third with the second.
+
+    When the loop settles depends on the losses, and whether it does on a machine that is in time.
+    """
     monkeypatch.chdir(tmp_path)
     (code,) = blocks("README.md", "python")
     assert blocks("docs/tutorial.md", "python") == [code]  # it goes the same way
@@ -43,16 +46,17 @@ def test_the_way_of_the_readme_leads_from_a_plant_to_a_live_loop(
     shown = next(text for language, text in fences("README.md") if text.startswith("angle stays within"))
     for line in way.splitlines():
         _, *words = shlex.split(line.partition("#")[0])
-        more = ["--no-report", "--set=speed=4"] if words[0] == "run" else []
+        more = ["--no-report"] if words[0] == "run" else []
         finished = invoke(*words, *more)
         assert finished.exit_code == 0, finished.output
         printed, (guaranteed, happened) = " ".join(finished.stdout.split()), shown.splitlines()
         if words[0] != "run":
             assert alike(printed[: len(guaranteed)], guaranteed)
+        elif "conforms until" in printed:
+            assert printed.startswith("angle was ")
+            assert "late" in printed
         else:
-            assert printed.startswith(
-                happened.partition(" from ")[0]
-            )  # when it settles depends on the losses
+            assert printed.startswith(happened.partition(" from ")[0])
 
 
 @pytest.mark.system

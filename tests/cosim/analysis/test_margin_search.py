@@ -160,7 +160,7 @@ def test_ctrl_c_leaves_what_was_decided(monkeypatch: pytest.MonkeyPatch, json_ou
         assert document["missing"] == missing
         assert document["period"] is None
     else:
-        assert "proven stable for every loss pattern with M ≤ 2" in result.stdout
+        assert "\nstable for every loss pattern with M ≤ 2" in result.stdout  # noack-check was not asked yet
 
 
 def test_no_longest_time_between_updates_is_below_the_least_one(monkeypatch: pytest.MonkeyPatch) -> None:
