@@ -165,7 +165,7 @@ format: setup-dev ## Format the code
 bench: setup-dev ## Run the benchmarks and print tables
 	$(BIN)/python -m benchmarks $(ARGS)
 
-screenshots: setup ## Make docs/run.png; needs Chromium
+screenshots: setup-dev ## Make docs/run.png; needs Chromium
 	@$(BIN)/noack simulate lane_following --no-report
 	@$(BIN)/python tools/screenshot_recording.py runs/latest/recording.rrd docs/run.png --size 1600x900
 

@@ -1,25 +1,20 @@
 """A headless browser for tests."""
 
-import os
-import shutil
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
+from playwright.sync_api import Browser
 
-from tools.screenshot_recording import Browser
+from netem.core.errors import MachineError
+from tools.screenshot_recording import headless_browser
 
 
 @contextmanager
-def started(profile: Path, *card: str) -> Iterator[Browser]:
-    """Start a headless browser within the context; skip the test if there is none."""
-    program = shutil.which("chromium") or shutil.which("google-chrome")
-    if program is None or sys.platform != "linux" or not hasattr(os, "fork"):
-        pytest.skip("no chromium here")
-    browser = Browser(program, str(profile), card)
+def started() -> Iterator[Browser]:
+    """Run a headless browser within the context; skip the test if there is none."""
     try:
-        yield browser
-    finally:
-        browser.close()
+        with headless_browser() as browser:
+            yield browser
+    except MachineError as error:
+        pytest.skip(str(error))

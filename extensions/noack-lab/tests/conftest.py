@@ -4,18 +4,18 @@ import json
 import re
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from playwright.sync_api import Browser
+from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
 from noack_lab.live_run import noack_program
 from tests.helpers.browser import started
 from tests.helpers.waiting import PATIENCE_S
-from tools.screenshot_recording import Browser
 
 TEXT = "document.body.innerText"
 _TWO_FRAMES = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
@@ -42,33 +42,25 @@ def served(folder: Path, *arguments: str) -> Iterator[str]:
     assert not text, text
 
 
-class Page:
-    """A tab of the browser."""
+class LabPage:
+    """A tab of the browser that shows the page."""
 
-    def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (1280, 900)) -> None:
-        self._browser = browser
-        browser.open("about:blank", *size)
-        browser.call("Emulation.setFocusEmulationEnabled", enabled=True)
-        self._session = browser.session
-        self.call("Page.navigate", url=address)
+    def __init__(self, browser: Browser, address: str, width: int = 1280, height: int = 900) -> None:
+        self.tab = browser.new_page(viewport={"width": width, "height": height})
+        self.tab.set_default_timeout(1e3 * PATIENCE_S)
+        self.tab.goto(address)
         self.wait(f"{TEXT}.includes('transmissions')")  # it is connected
-
-    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Send a command to this tab."""
-        self._browser.session = self._session
-        return self._browser.call(method, **parameters)
 
     def js(self, expression: str) -> Any:
         """Return the value of a JavaScript expression; a promise is awaited."""
-        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
-        return answer["result"].get("value")
+        return self.tab.evaluate(expression)
 
     def wait(self, condition: str) -> None:
         """Wait until a JavaScript expression is true."""
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not self.js(condition):
-            assert time.monotonic() < deadline_s, (condition, self.js(TEXT))
-            time.sleep(0.05)
+        try:
+            self.tab.wait_for_function(condition, polling=50)
+        except PlaywrightTimeoutError:
+            pytest.fail(f"{condition} does not become true of {self.js(TEXT)}")
 
     def click(self, text: str) -> None:
         """Click on a button whose text ends so, once it can be clicked."""
@@ -87,16 +79,16 @@ class Page:
             "return [r.x, r.y + r.height / 2, r.width]; })"
             f"(document.querySelector('.q-slider[aria-label^={json.dumps(label)}]'))"
         )
-        moves = ("mousePressed", 0.4), ("mouseMoved", 0.45), ("mouseMoved", to), ("mouseReleased", to)
-        for kind, share in moves:
-            self.call("Input.dispatchMouseEvent", type=kind, x=x + share * width, y=y,
-                      button="left", buttons=1, clickCount=1)  # fmt: skip
+        self.tab.mouse.move(x + 0.4 * width, y)
+        self.tab.mouse.down()
+        for share in (0.45, to):
+            self.tab.mouse.move(x + share * width, y)
             self.js(_TWO_FRAMES)  # the browser joins moves within a frame
+        self.tab.mouse.up()
 
     def resize(self, width: int, height: int) -> None:
         """Give the window another size."""
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height,
-                  deviceScaleFactor=1, mobile=False)  # fmt: skip
+        self.tab.set_viewport_size({"width": width, "height": height})
         self.js(_TWO_FRAMES)
 
 
@@ -112,16 +104,14 @@ def address(folder: Path) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with started(tmp_path_factory.mktemp("browser")) as browser:
+def browser() -> Iterator[Browser]:
+    with started() as browser:
         yield browser
 
 
 @pytest.fixture
-def open_page(program: Browser, address: str) -> Iterator[Callable[..., Page]]:
+def open_page(browser: Browser, address: str) -> Iterator[Callable[..., LabPage]]:
     """Open a tab; the tabs of a test are closed after it."""
-    yield lambda *size: Page(program, address, size or (1280, 900))
-    program.session = None
-    for target in program.call("Target.getTargets")["targetInfos"]:
-        if target["type"] == "page" and target["url"] != "about:blank":
-            program.call("Target.closeTarget", targetId=target["targetId"])
+    yield lambda *size: LabPage(browser, address, *size)
+    for context in browser.contexts:
+        context.close()

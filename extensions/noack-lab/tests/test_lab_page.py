@@ -54,7 +54,7 @@ def test_a_mistake_in_the_text_is_said_and_the_figure_pales(open_page: OpenPage)
     page.click("all settings (TOML)")
     editor = "document.querySelector('.cm-content')"
     page.wait(f"({editor}?.focus(), document.activeElement === {editor})")
-    page.call("Input.insertText", text="horizon_s = -1\n")
+    page.tab.keyboard.insert_text("horizon_s = -1\n")
     page.wait(f"{PALE} && {TEXT}.includes('not TOML: ')")  # the key is given twice
 
 
@@ -120,7 +120,7 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_chosen_recorded_run(
     report = page.js("[...document.links].find(e => e.innerText.startsWith('report')).href")
     assert report == f"{address}report/{run.name}"
     # The report comes without scripts, and only for whom the page's address is known.
-    page.call("Page.navigate", url=report)
+    page.tab.goto(report)
     page.wait(f"{TEXT}.includes('completed 4 s') && origin === 'null'")
     for wrong in (report.replace("/report/", "x/report/"), report + "x"):
         with pytest.raises(HTTPError) as error:

@@ -129,16 +129,12 @@ texts below 10 pixels, of their glyphs that are cut, and what is wider than the 
 @pytest.mark.system
 def test_nothing_is_cut_or_too_small_to_read_on_any_screen(record: RunRecord, tmp_path: Path) -> None:
     written(record, tmp_path, claims=CLAIMS)
-    with started(tmp_path / "profile") as browser:
-        browser.open("about:blank", 390, 844)
-        browser.call("Page.navigate", url=(tmp_path / REPORT_FILE).as_uri())
-        loaded = "new Promise(done => document.readyState === 'complete' ? done() : onload = done)"
-        browser.call("Runtime.evaluate", expression=loaded, awaitPromise=True)
+    with started() as browser:
+        page = browser.new_page()
+        page.goto((tmp_path / REPORT_FILE).as_uri())
         for width in (390, 768, 847, 849, 1366, 1920):
-            size = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": False}
-            browser.call("Emulation.setDeviceMetricsOverride", **size)
-            outside = browser.call("Runtime.evaluate", expression=OUTSIDE, returnByValue=True)["result"]
-            assert outside["value"] == [len(FIGURES + TIMED), 0, 0, 0, 0, ""], width
+            page.set_viewport_size({"width": width, "height": 844})
+            assert page.evaluate(OUTSIDE) == [len(FIGURES + TIMED), 0, 0, 0, 0, ""], width
 
 
 HOSTILE_NAME = "</title></svg><script>alert('x')</script> & {\"x"
