@@ -18,6 +18,7 @@ from noack.core.balls import columns_of, identity, is_zero, rows_of
 from noack.core.linear_systems import Matrix
 from noack.proof.elaborate.hybrid_system import ContinuousFlow, Edge, Location, Model, UnknownSignal
 from noack.proof.elaborate.loop import Loop
+from noack.proof.no_document import NoDocumentError as NoDocumentError
 from noack.proof.numbers import (
     Fractions,
     Number,
@@ -60,10 +61,6 @@ BOUND_OF_E, BOUND_OF_W = "bound of e", "bound of w"
 ERROR = "e_s"
 DRIFT = "drift"
 """The output W(ẋ − Hx), as the search calls it."""
-
-
-class NoDocumentError(ValueError):
-    """A loop that no document describes yet; the message says why."""
 
 
 @dataclass(frozen=True)

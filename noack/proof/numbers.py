@@ -7,6 +7,8 @@ from fractions import Fraction
 import numpy as np
 from flint import arb, arb_mat, fmpq
 
+from noack.proof.no_document import NoDocumentError
+
 _MOST_DENOMINATOR = 10**12
 _SMALL, _ROUNDED = 1e-14, 1e-12
 """Shares below which an eigenvalue is 0, and by which others are rounded outwards."""
@@ -44,8 +46,15 @@ def entry(value: arb | fmpq) -> Number | list[float]:
 
 
 def above(value: Fraction) -> float:
-    """Return a float whose decimal is at least a value."""
-    found = float(value)
+    """Return a float whose decimal is at least a value.
+
+    Raises:
+        NoDocumentError: the value is beyond all floats, as e^(−As) of a stiff model and an old input.
+    """
+    try:
+        found = float(value)
+    except OverflowError:
+        raise NoDocumentError("a number of its document would be larger than 1e308") from None
     while Fraction(repr(found)) < value:
         found = math.nextafter(found, math.inf)
     return found

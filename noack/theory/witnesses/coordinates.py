@@ -14,6 +14,7 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.proof.elaborate.hybrid_system import Model
+from noack.theory.witnesses.effort import NoWitnessError
 
 Frames = Mapping[str, Matrix]
 """By the name of a witness's matrix V: T with V = T⁻ᵀ V̂ T⁻¹, V̂ of order 1."""
@@ -28,8 +29,15 @@ _LOSS_RATES = (0.0, 0.3, 0.6, 0.9, 1.0)
 
 
 def floats(M: arb_mat) -> Matrix:
-    """Return the midpoints."""
-    return np.array([float(v) for v in M.entries()]).reshape(M.nrows(), M.ncols())
+    """Return the midpoints.
+
+    Raises:
+        NoWitnessError: one is beyond all floats, as e^(−As) of a stiff model and an old input.
+    """
+    values = np.array([float(v) for v in M.entries()]).reshape(M.nrows(), M.ncols())
+    if not np.isfinite(values).all():
+        raise NoWitnessError("the loop's inequalities have numbers larger than 1e308")
+    return values
 
 
 def simulated_frames(model: Model) -> Frames:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.studies.new_loop import new_scenario
+from cosim.studies.new_loop import choose
 from noack.controllers.state_space import StateSpaceSettings
 from noack.scenario.integrals import augmented, require_held
 from noack.scenario.resolution import loop_of, resolve
@@ -89,7 +89,7 @@ def test_the_gain_has_the_poles_that_are_given(tmp_path: Path, monkeypatch: pyte
     assert document["integral"] == ["angle"]
     assert 'integral = ["angle"]' in repr(result)
     (tmp_path / "gain.json").write_text(json.dumps(document))
-    monkeypatch.setattr(new_scenario, "RUN_WORK", 0.0)  # no search for proofs
+    monkeypatch.setattr(choose, "RUN_WORK", 0.0)  # no search for proofs
     new = noack.new(tmp_path / "gain.json", tmp_path / "servo.toml")
     assert 'integral = ["angle"]' in new.text
     assert np.array_equal(loop_of(resolve(new.scenario)).K, GAIN)

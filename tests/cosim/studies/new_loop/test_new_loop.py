@@ -11,8 +11,11 @@ from scipy.linalg import solve_continuous_are
 
 import noack
 from cosim.analysis.certificates import Certificates
+from cosim.studies.new_loop import choose, new_scenario
+from cosim.studies.new_loop.choices import Choices
 from cosim.studies.new_loop.linear_model import controllable_states
-from cosim.studies.new_loop.new_scenario import _Trial, _TrialScenarios
+from cosim.studies.new_loop.trial_scenario import scenario_of
+from cosim.studies.new_loop.trials import Trial
 from netem.core.errors import CallerError
 from noack.plants.systems import linearisation
 from noack.scenario.outputs import LoopOutput
@@ -165,18 +168,26 @@ def test_a_loop_that_is_not_certified_with_the_fewest_losses_is_not_tried_with_m
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Late inputs: nothing is certified. Of each of 3 gains and 2 rates, two loops are tried instead of 8."""
-    tried, certify = list[tuple[str, float, int]](), _TrialScenarios.certify
+    tried, certificate_of = list[tuple[str, float, int]](), choose.certificate_of
 
-    def counted(trials: _TrialScenarios, trial: _Trial) -> ScenarioCertificate:
+    def counted(choices: Choices, trial: Trial) -> ScenarioCertificate:
         tried.append((trial.gain.method, trial.rate_hz, trial.mansd))
-        return certify(trials, trial)
+        return certificate_of(choices, trial)
 
-    monkeypatch.setattr(_TrialScenarios, "certify", counted)
+    monkeypatch.setattr(choose, "certificate_of", counted)
     delay = {"kind": "delay", "delay_s": 5.0}
     settings = {"network.impairments": [delay], "horizon_s": 5.0}
     made = noack.new("unstable_pendulum", allowed={}, settings=settings)
     assert made.certificate is None
     assert len(set(tried)) == 3 * 2 * 2
+
+
+@pytest.mark.usefixtures("short_searches")
+def test_a_plant_whose_current_is_too_fast_for_its_rate_has_no_guarantee() -> None:
+    """e^(−As) of the motor's current, of 1.5e6 /s, and an input of 1 ms is beyond all floats."""
+    made = noack.new("dc_motor")
+    assert made.guarantee.startswith("no guarantee: ")
+    assert "numbers larger than 1e308" in made.guarantee
 
 
 @pytest.mark.deep
@@ -236,13 +247,13 @@ def test_a_guarantee_is_kept_if_nothing_is_proven_with_a_larger_threshold(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     Path("servo.py").write_text(SERVO)
-    prove, tried = _TrialScenarios._proven, list[_Trial]()
+    prove, tried = choose.TrialProofs.of, list[Trial]()
 
-    def only_the_first(trials: _TrialScenarios, trial: _Trial) -> Certificates:
+    def only_the_first(proofs: choose.TrialProofs, trial: Trial) -> Certificates:
         tried.append(trial)
-        return prove(trials, trial) if len(tried) == 1 else Certificates(trials.scenario(trial))
+        return prove(proofs, trial) if len(tried) == 1 else Certificates(scenario_of(proofs.choices, trial))
 
-    monkeypatch.setattr(_TrialScenarios, "_proven", only_the_first)
+    monkeypatch.setattr(choose.TrialProofs, "of", only_the_first)
     made = noack.new("servo.py", "servo.toml")
     assert len(tried) == 2
     first_proof = "angle stays within 0.144 rad of its set-point in the end, not within 0.02 rad"
@@ -253,14 +264,14 @@ def test_a_guarantee_is_kept_if_nothing_is_proven_with_a_larger_threshold(
 def test_the_written_settings_are_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
     """Proofs change the threshold after the first simulation; what is said is about the last one."""
     Path("servo.py").write_text(SERVO)
-    returns, simulated = _TrialScenarios.returns, list[noack.Scenario]()
+    simulated = list[noack.Scenario]()
 
-    def noted(trials: _TrialScenarios, trial: _Trial) -> bool:
-        simulated.append(trials.scenario(trial))
-        returns(trials, trial)
+    def noted(choices: Choices, trial: Trial) -> bool:
+        simulated.append(scenario_of(choices, trial))
+        choose.returns_to_rest(choices, trial)
         return len(simulated) == 1
 
-    monkeypatch.setattr(_TrialScenarios, "returns", noted)
+    monkeypatch.setattr(new_scenario, "returns_to_rest", noted)
     made = noack.new("servo.py", "servo.toml")
     assert simulated[-1] == made.scenario != simulated[0]
     assert any("the loop does not return to 0" in note for note in made.notes)
