@@ -57,7 +57,7 @@ words, in the order in which they apply; T is a time (10ms), P a percentage (5%)
 
 settings, at any place:
   mansd N    at most N consecutive losses in each flow
-  atmost M in K  at most M losses in any K consecutive datagrams
+  atmost N in K  at most N losses in any K consecutive datagrams
   recover H  at least H consecutive deliveries between two loss bursts
   first      the first datagram of each flow is delivered
   limit N    at most N datagrams are delayed at a time

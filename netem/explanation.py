@@ -163,7 +163,7 @@ def settings_meaning(settings: LinkSettings) -> Iterator[tuple[str, str]]:
     """Yield (words, meaning) of the cap and the other settings."""
     if settings.mansd is not None:
         meaning = f"at most {settings.mansd} consecutive packets of a flow are not delivered"
-        yield f"mansd {settings.mansd}", f"the cap (M − 1): {meaning}; the next one is always delivered"
+        yield f"mansd {settings.mansd}", f"the guarantee: {meaning}; the next one is always delivered"
     for constraint in settings.constraints:
         yield constraint.text(), constraint.meaning()
     if settings.first_delivered:
@@ -276,11 +276,9 @@ def _print_bursts(console: Console, bursts: BurstPrediction, with_cap: float | N
     mean = f"{bursts.mean_burst:.3g} packets long on average" if bursts.mean_burst else "endless"
     behind = "" if with_cap is None else f"; with the guarantee {with_cap:.3g}"
     console.print(Text(f"loss bursts without a cap: {mean}{behind}"))
-    console.print(
-        Text(f"chance that within {bursts.packets} packets one is longer than M − 1, without a cap:")
-    )
+    console.print(Text(f"chance that within {bursts.packets} packets more are lost in a row, without a cap:"))
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, show_header=False)
-    table.add_row("  M − 1", *map(str, bursts.chance))
+    table.add_row("  lost in a row, more than", *map(str, bursts.chance))
     table.add_row("  chance", *map(chance_text, bursts.chance.values()))
     console.print(table)
 

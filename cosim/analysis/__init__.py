@@ -3,7 +3,7 @@
 Of a scenario:
 
 * ``certificates.py`` has all certificates, as one object and as a table.
-* ``margin_search.py`` finds the largest M for which the loop is stable, ``mean_cost.py`` its cost
+* ``margin_search.py`` finds with how many losses in a row the loop is stable, ``mean_cost.py`` its cost
   under random losses. The mathematics of both is in ``noack/theory``.
 * ``adversary`` searches for the loss pattern that comes closest to a certificate's bound.
 

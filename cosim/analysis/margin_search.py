@@ -1,4 +1,4 @@
-"""The margin of a loop: the largest M, and the longest time between events for its own M.
+"""The loss margin of a loop: how many packets may be lost in a row, and how far apart events may be.
 
 Other guarantees than the scenario's own one are compared with it, too: their growth, and which of
 them imply others.
@@ -26,15 +26,15 @@ from noack.scenario.scenario import Scenario
 from noack.theory.random_losses.mean_square_growth import MeanSquareGrowth, growth_without_guarantee
 from noack.theory.witnesses.loss_margin import ACCURACY, LossMargin, Stability, capped, uncapped
 
-MOST_M = 16
-"""Largest M that is examined by default."""
-_LARGEST_M = 1000
-"""Largest M that may be examined."""
+MOST_MANSD = 15
+"""Largest number of losses in a row that is examined by default."""
+_LARGEST_MANSD = 999
+"""Largest number of losses in a row that may be examined."""
 _LARGEST_EFFORT = 1e6
 """Largest factor of the work that may be asked for."""
 
-_CAPS, _OTHERS, _PERIOD, _RANDOM = "M", "the other guarantees", "the longest period", "random losses"
-_CERTIFICATE = "the certificate"
+_CAPS, _OTHERS, _PERIOD = "losses in a row", "the other guarantees", "the longest period"
+_RANDOM, _CERTIFICATE = "random losses", "the certificate"
 """What is examined, in this order."""
 
 MarginProgress = Callable[[str], None]
@@ -130,10 +130,10 @@ def undecided_text(stability: Stability) -> str:
 
 
 class LossCap(NamedTuple):
-    """An M, and what is known about the loop with it."""
+    """A limit of the losses in a row, and what is known about the loop with it."""
 
-    m: int
-    """M; at most M − 1 consecutive losses."""
+    mansd: int
+    """At most this number of packets is lost in a row."""
     stability: Stability
 
     @property
@@ -152,13 +152,13 @@ class LossCap(NamedTuple):
         lost = [number for number, delivered in enumerate(pattern) if not delivered]
         script = f'{{model="scripted", lost={lost}, repeat_every={len(pattern)}}}'
         trigger = f'{{policy="periodic", period_s={self.stability.intervals_s[0]!r}}}'
-        return f"network.mansd={self.m - 1}", f"network.loss={script}", f"trigger={trigger}"
+        return f"network.mansd={self.mansd}", f"network.loss={script}", f"trigger={trigger}"
 
     @property
     def text(self) -> str:
         """The result in words."""
         bounds = f"growth per period {at_least(self.stability.lower)} to {at_most(self.stability.upper)}"
-        return f"at most {self.m - 1} lost in a row: {self.stability.verdict}, {bounds}"
+        return f"at most {self.mansd} lost in a row: {self.stability.verdict}, {bounds}"
 
 
 class PeriodLimit(NamedTuple):
@@ -191,9 +191,10 @@ class PeriodLimit(NamedTuple):
 
 @dataclass(frozen=True)
 class MarginResult:
-    """The margin of a loop.
+    """The loss margin of a loop.
 
-    ``print`` shows it in words; ``caps`` has the bounds for each M, ``period`` the longest period.
+    ``print`` shows it in words; ``caps`` has the bounds for each number of losses in a row, ``period`` the
+    longest period.
     """
 
     scenario: str
@@ -201,7 +202,7 @@ class MarginResult:
     between_updates: str
     """What the controller does between updates, in words."""
     mansd: int
-    """M − 1 of the scenario."""
+    """The scenario's largest number of losses in a row."""
     guarantee: str
     shortest_s: float
     """The shortest time between two transmissions."""
@@ -210,9 +211,9 @@ class MarginResult:
     delay_s: float
     """Delay of an update in the network."""
     caps: tuple[LossCap, ...]
-    """M = 1, 2, … up to the first one that is destabilised, or to the largest one examined."""
-    every_m: bool
-    """The constraints of the network allow no more losses with a larger M."""
+    """For 0, 1, 2, … losses in a row, up to the first number that destabilises, or the largest examined."""
+    every_mansd: bool
+    """The constraints of the network allow no more losses with a larger ``mansd``."""
     period: PeriodLimit | None
     """None if it was not searched for."""
     without_guarantee: MeanSquareGrowth | str
@@ -220,7 +221,7 @@ class MarginResult:
     certificate: CertificateAnswer | None = None
     """Whether the scenario has a certificate; None if this was not examined."""
     proof: MarginProof | None = None
-    """What noack-check has proven of the largest stable M and of the destabilising pattern."""
+    """What noack-check has proven of the largest stable number of losses and of the destabilising pattern."""
     effort: float = 1.0
     """Factor of the limits of the work for a decision."""
     compared: GuaranteeComparison = _NOT_COMPARED
@@ -238,39 +239,38 @@ class MarginResult:
         return self.shortest_s == self.period_s
 
     @property
-    def stable_m(self) -> int | None:
-        """The largest M with which every pattern is proven stable; None if there is none."""
-        stable = [cap.m for cap in self.caps if cap.stability.verdict == "stable"]
+    def stable_mansd(self) -> int | None:
+        """The largest number of losses in a row of which every pattern is stable; None: not even 0."""
+        stable = [cap.mansd for cap in self.caps if cap.stability.verdict == "stable"]
         return max(stable, default=None)
 
     @property
     def destabilised(self) -> LossCap | None:
-        """The smallest M with a destabilising pattern, if one was found."""
+        """The smallest number of losses in a row with a destabilising pattern, if one was found."""
         last = self.caps[-1]
         return last if last.stability.verdict == "destabilised" else None
 
     @property
     def verdict(self) -> str:
         """The margin in words."""
-        stable_m = self.stable_m
-        stable = "proven stable" if self._verified_m >= (stable_m or 0) else "stable"
-        parts = []
-        if stable_m == self.caps[-1].m and self.every_m:
-            parts = [f"{stable} for every loss pattern that the constraints allow, with every M ≥ {stable_m}"]
-        elif stable_m is not None:
-            parts = [f"{stable} for every loss pattern with M ≤ {stable_m}"]
+        most = self.stable_mansd
+        stable, parts = "stable" if self._is_unverified else "proven stable", []
+        if most == self.caps[-1].mansd and self.every_mansd:
+            parts = [f"{stable} for every loss pattern that the constraints allow, with any mansd ≥ {most}"]
+        elif most is not None:
+            parts = [f"{stable} for every loss pattern with at most {most} lost in a row"]
         parts += [
             f"{guarantee.meaning}: undecided, {undecided_text(guarantee.stability)}"
             for guarantee in self.compared.guarantees
             if guarantee.stability.verdict == "undecided"
         ]
         parts += [
-            f"M = {cap.m} is undecided: {undecided_text(cap.stability)}"
+            f"{cap.mansd} lost in a row: undecided, {undecided_text(cap.stability)}"
             for cap in self.caps  # of fewer losses all are stable
-            if cap.stability.verdict == "undecided" and cap.m > (stable_m or 0)
+            if cap.stability.verdict == "undecided" and (most is None or cap.mansd > most)
         ]
         if (last := self.destabilised) is not None:
-            parts.append(f"this pattern destabilises M = {last.m}: {last.stability.text}")
+            parts.append(f"with {last.mansd} lost in a row this pattern destabilises: {last.stability.text}")
         return "; ".join(parts)
 
     def __repr__(self) -> str:
@@ -293,19 +293,20 @@ class MarginResult:
         return [text for text in (self.unverified_text, self.ties, self.late_inputs) if text]
 
     @property
-    def _verified_m(self) -> int:
-        """The largest M whose stability noack-check has verified; 0 if there is none."""
+    def _is_unverified(self) -> bool:
+        """Whether noack-check has not verified that the loop is stable with the largest number of losses."""
         caps = () if self.proof is None else self.caps
-        return max((cap.m for cap in caps if "most" in cap.stability.entries), default=0)
+        verified = max((cap.mansd for cap in caps if "most" in cap.stability.entries), default=-1)
+        return self.stable_mansd is not None and verified < self.stable_mansd
 
     @property
     def unverified_text(self) -> str:
         """What of the verdict noack-check has not verified, as a sentence; empty if it has verified all."""
         last, whats = self.destabilised, list[str]()
-        if self._verified_m < (self.stable_m or 0):
-            whats.append(f"that M = {self.stable_m} is stable")
+        if self._is_unverified:
+            whats.append(f"that the loop is stable with at most {self.stable_mansd} lost in a row")
         if last is not None and (self.proof is None or "least" not in last.stability.entries):
-            whats.append(f"that M = {last.m} is destabilised")
+            whats.append(f"that a pattern with {last.mansd} lost in a row destabilises it")
         if not whats:
             return ""
         return f"{' and '.join(whats)}: computed by noack with error bounds, not verified by noack-check"
@@ -334,8 +335,8 @@ class MarginResult:
         growth = self.without_guarantee
         return vars(self) | {
             "verdict": self.verdict,
-            "stable_m": self.stable_m,
-            "caps": [{"m": cap.m, **cap.stability.to_json()} for cap in self.caps],
+            "stable_mansd": self.stable_mansd,
+            "caps": [{"mansd": cap.mansd, **cap.stability.to_json()} for cap in self.caps],
             "compared": [
                 {"guarantee": guarantee.meaning, **guarantee.stability.to_json()}
                 for guarantee in self.compared.guarantees
@@ -352,7 +353,7 @@ class MarginResult:
 def find_margin(
     resolved: Scenario,
     *,
-    most_m: int = MOST_M,
+    most_mansd: int = MOST_MANSD,
     accuracy: float = ACCURACY,
     with_period: bool = True,
     guarantees: Sequence[str] = (),
@@ -365,21 +366,21 @@ def find_margin(
 
     Args:
         resolved: the resolved scenario; its trigger has a longest time between two events.
-        most_m: largest M to examine.
+        most_mansd: largest number of losses in a row to examine.
         accuracy: wanted ratio of upper and lower bound, minus 1.
         with_period: whether to search for the longest period, too.
         guarantees: other guarantees to examine, in words such as ``mansd 4 atmost 3 in 10``.
         effort: factor of the limits of the work for a decision.
         progress: receives what is examined next.
-        decided: receives the result for each M, as soon as it is known.
+        decided: receives the result for each number of losses in a row, as soon as it is known.
         on_stop: receives the request to stop, after which the result has what was decided until then;
-            without it, or before a result for M = 1, the request is raised.
+            without it, or before a result without losses, the request is raised.
 
     Raises:
         CallerError: the loop is not covered, or a number is out of range.
         StopRequestError: see ``on_stop``.
     """
-    most_m = whole_number("most", most_m, 1, _LARGEST_M)
+    most = whole_number("most", most_mansd, 0, _LARGEST_MANSD)
     _require_in_range(accuracy, effort)
     margin, network = LossMargin(resolved), resolved.network
     other_rules = uncapped(network.guarantee)
@@ -391,7 +392,7 @@ def find_margin(
         return margin.stability(guarantee, accuracy, effort=effort)
 
     caps: list[LossCap] = []
-    every_m, compared = False, _NOT_COMPARED
+    every_mansd, compared = False, _NOT_COMPARED
     limit: PeriodLimit | None = None
     growth: MeanSquareGrowth | str = "not examined"
     certificate: CertificateAnswer | None = None
@@ -399,19 +400,13 @@ def find_margin(
     missing = [_CAPS, *([_OTHERS] if others_read else []), *([_PERIOD] if with_period else [])]
     missing += [_RANDOM, _CERTIFICATE]
     try:
-        # M = 1, 2, … up to the first one that is destabilised, or that the other rules imply.
-        for m in range(1, most_m + 1):
-            caps.append(
-                LossCap(
-                    m,
-                    examine(
-                        capped(other_rules, m - 1), f"at most {m - 1} lost in a row (up to {most_m - 1})"
-                    ),
-                )
-            )
+        # 0, 1, 2, … up to the first number that destabilises, or that the other rules imply.
+        for mansd in range(most + 1):
+            text = f"at most {mansd} lost in a row (up to {most})"
+            caps.append(LossCap(mansd, examine(capped(other_rules, mansd), text)))
             decided(caps[-1])
-            every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
-            if every_m or caps[-1].stability.verdict == "destabilised":
+            every_mansd = other_rules.longest_burst is not None and other_rules.longest_burst <= mansd
+            if every_mansd or caps[-1].stability.verdict == "destabilised":
                 break
         missing.remove(_CAPS)
         progress("a proof for noack-check")
@@ -441,7 +436,7 @@ def find_margin(
         period_s=margin.seconds(margin.longest),
         delay_s=float(margin.delay_ns / NS_PER_S),
         caps=_with_implied_bounds(caps),
-        every_m=every_m,
+        every_mansd=every_mansd,
         period=limit,
         without_guarantee=growth,
         certificate=certificate,
@@ -450,15 +445,15 @@ def find_margin(
         compared=compared,
         ties=margin.ties,
         late_inputs=_of_late_inputs(resolved, margin),
-        missing=tuple(f"M from {len(caps) + 1} on" if what == _CAPS else what for what in missing),
+        missing=tuple(f"{len(caps)} and more {_CAPS}" if what == _CAPS else what for what in missing),
     )
 
 
 def _with_implied_bounds(caps: Sequence[LossCap]) -> tuple[LossCap, ...]:
-    """Return the results for M = 1, 2, … with what follows from each other.
+    """Return the results for 0, 1, 2, … losses in a row with what follows from each other.
 
-    A larger M allows all patterns of a smaller one: it has its lower bound, and this one the upper
-    bound of the larger one.
+    A larger number allows all patterns of a smaller one: the larger number has the smaller one's lower bound,
+    and the smaller number has the larger one's upper bound.
     """
     bounds = [cap.stability for cap in caps]
     for i in range(1, len(caps)):

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 
 from cosim.analysis.certificates import Certificates, certificates_of
-from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
+from cosim.analysis.margin_search import MOST_MANSD, MarginResult, find_margin
 from cosim.analysis.mean_cost import MeanCost, find_mean_cost
 from cosim.api.scenarios import Source, load
 from cosim.live.monitoring.progress import work_bar
@@ -51,24 +51,24 @@ def certify(
 def margin(
     scenario: Source,
     *,
-    most_m: int = MOST_M,
+    most_mansd: int = MOST_MANSD,
     accuracy: float = ACCURACY,
     period: bool = True,
     guarantees: Sequence[str] = (),
     effort: float = 1.0,
 ) -> MarginResult:
-    """Return the largest M for which a loop is stable under every loss pattern.
+    """Return how many packets may be lost in a row while a loop is stable under every loss pattern.
 
     >>> import noack
-    >>> noack.margin("lane_periodic", most_m=3, period=False).stable_m
-    3
+    >>> noack.margin("lane_periodic", most_mansd=2, period=False).stable_mansd
+    2
 
     Args:
         scenario: a scenario whose trigger has a longest time between two events, as ``periodic``
             and ``deadline`` have, or a source that :func:`noack.load` accepts.
-        most_m: largest M to examine.
+        most_mansd: largest number of losses in a row to examine.
         accuracy: wanted ratio of upper and lower bound of the growth, minus 1.
-        period: whether to search for the longest period with the scenario's own M, too.
+        period: whether to search for the longest period with the scenario's own guarantee, too.
         guarantees: other guarantees to examine, in words such as ``mansd 4 atmost 3 in 10``.
         effort: factor of the work that a decision may take.
 
@@ -78,7 +78,7 @@ def margin(
     """
     return find_margin(
         resolve(load(scenario)),
-        most_m=most_m,
+        most_mansd=most_mansd,
         accuracy=accuracy,
         with_period=period,
         guarantees=guarantees,

@@ -91,7 +91,7 @@ def measure(
         sources: a file, the name of a shipped trace, or files that belong together.
         deadline_s: a packet that takes longer counts as lost.
         outage_s: loss bursts of this duration or more are outages; by default a test decides.
-        shares: shares of loss bursts and packets for which M is given.
+        shares: shares of loss bursts and packets for which the losses in a row are given.
         windows: K of the (m, K) table.
         within: packets, or a time such as ``"600s"``, for the chance of a long loss burst.
         interval_s: transfer interval of a service; by default the period of the trace.

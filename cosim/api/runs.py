@@ -183,7 +183,7 @@ class Run:
 
         Returns:
             ``event``, its number; ``t_s`` and ``t_ns``; ``interval_s``, the inter-event time, NaN
-            for the first event; ``fate`` in the network: delivered, forced (delivered because M − 1
+            for the first event; ``fate`` in the network: delivered, forced (delivered because ``mansd``
             was reached), dropped, corrupted, overflowed, blacked_out, delivered_out_of_order,
             in_flight at the end, or none, if it did not reach the network; ``received``, whether
             the controller processed it.

@@ -112,7 +112,7 @@ def from_system(
 
     Without ``settings``, these values are chosen: the trigger's α is half the decay rate of Â +
     B̂K; its β is a tenth of ‖x(0)‖ (0.1 if x(0) = 0); the horizon is the time in which e^(−αt)
-    falls to a hundredth. Each has three digits. M − 1 is 4, and half of the updates are lost.
+    falls to a hundredth. Each has three digits. At most 4 updates are lost in a row, and half of all.
 
     >>> import noack
     >>> A, B = [[0.0, 1.0], [2.0, -0.5]], [[0.0], [1.0]]

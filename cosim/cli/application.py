@@ -188,7 +188,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     help="A laboratory for event-triggered control over lossy networks without acknowledgements. "
-    "The loop runs as real processes over UDP; the network loses at most M − 1 consecutive packets.\n\n"
+    "The loop runs as real processes over UDP; the network loses at most mansd packets in a row.\n\n"
     "Each command has --help, with examples at the end. A scenario is a TOML file, or the name of a "
     "shipped one.",
     epilog=examples(

@@ -303,7 +303,7 @@ def _growth(growth: Stability) -> tuple[str, str]:
 
 
 def margin_document(margin: MarginResult) -> Document:
-    """Return the bounds for each M, and the verdicts."""
+    """Return the bounds for each number of losses in a row, and the verdicts."""
     proof = [] if margin.proof is None else margin.proof.lines
     texts = [margin.verdict, *margin.condition_texts, *proof, *margin.compared.relations]
     if margin.period is not None:
@@ -325,7 +325,7 @@ def margin_document(margin: MarginResult) -> Document:
 
 
 def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
-    """Yield the bounds of the growth for each M, and for guarantees that are compared."""
+    """Yield the bounds of the growth for each number of losses in a row, and for compared guarantees."""
     delay = f", updates delayed by {margin.delay_s:g} s" if margin.delay_s else ""
     times = f"with an update every {margin.period_s:g} s"
     if not margin.is_periodic:
@@ -334,9 +334,9 @@ def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
         "margin",
         f"{margin.scenario}: growth of the worst loss pattern per {margin.period_s:g} s, "
         f"{times}, {margin.between_updates}{delay}",
-        ("M", "M − 1", "at least", "at most", "verdict"),
-        [(str(m), str(m - 1), *_growth(growth), growth.verdict) for m, growth in margin.caps],
-        left=[4],
+        ("lost in a row", "growth at least", "growth at most", "verdict"),
+        [(str(mansd), *_growth(growth), growth.verdict) for mansd, growth in margin.caps],
+        left=[3],
         tones=_MARGIN_TONES,
     )
     if margin.compared.guarantees:

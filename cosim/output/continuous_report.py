@@ -26,7 +26,7 @@ def continuous_document(run: ContinuousRun, scenario: Scenario) -> Document:
         ("‖x‖ at the start", number(summary.initial_state_norm)),
         ("‖x‖ at the end", number(summary.final_state_norm)),
     )
-    cap = f"M − 1 = {summary.mansd}"
+    cap = f"at most {summary.mansd} lost in a row"
     title = title_of(summary.scenario, summary.mode, cap, constraints, "continuous")
     return Document(
         title=title,

@@ -96,7 +96,7 @@ class Report:
 
     @property
     def subtitle(self) -> str:
-        """One line: kind of the run, mode, M − 1, start."""
+        """One line: kind of the run, mode, most losses in a row, start."""
         mode = f", {mode_words(self.loop.mode)}"
         if self.shares_network:
             mode = f" of {len(self.summary.loops)} loops on one network"
@@ -290,7 +290,7 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield "between updates", scenario.between_updates
     yield "trigger", trigger.description
     yield "norm of errors", "‖e‖₂" if trigger.weight is None else "‖W e‖₂, W from the scenario"
-    yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
+    yield "lost in a row, at most", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
     if network.constraints:
         yield "constraints on losses", ", ".join(rule.text() for rule in network.constraints)
     yield "loss", f"{model} ({details})" if details else model

@@ -193,7 +193,7 @@ def _losses(summary: RunSummary, loop: LoopSummary) -> Iterator[tuple[str, str]]
             yield f"longest loss burst of {name}", str(sent.longest_loss_burst)
     yield burst_row(max(caps(summary)), summary.constraints, loop.longest_loss_burst)
     violated = [violation.cause for violation in loop.violations]
-    yield "loss bursts beyond M − 1", str(violated.count("dropouts"))
+    yield "longer loss bursts than allowed", str(violated.count("dropouts"))
     for constraint in summary.constraints:
         yield f"violations of {constraint}", str(violated.count(constraint))
 
@@ -204,23 +204,21 @@ def lost_row(lost: int, delivered: int) -> tuple[str, str]:
 
 
 def caps(summary: RunSummary) -> list[int]:
-    """Return the values of M − 1 of a run, which may have changed it, in their order."""
+    """Return the values of ``mansd`` of a run, which may have changed it, in their order."""
     changed = (change.settings.get(MANSD) for change in summary.changes)
     return [summary.mansd, *(cap for cap in changed if isinstance(cap, int))]
 
 
 def caps_text(summary: RunSummary) -> str:
-    """Write the values of M − 1 of a run, as in ``M − 1 = 3 → 1``."""
-    return f"M − 1 = {' → '.join(map(str, caps(summary)))}"
+    """Write the values of ``mansd`` of a run, as in ``at most 3 → 1 lost in a row``."""
+    return f"at most {' → '.join(map(str, caps(summary)))} lost in a row"
 
 
 def burst_row(cap: int, constraints: Sequence[str], longest: int) -> tuple[str, str]:
     """Return the row of the longest loss burst, with the most consecutive losses allowed."""
     words = [f"mansd {cap}", *constraints]
     limit = settings_of(" ".join(words)).longest_burst
-    if limit != cap:
-        return f"longest loss burst (at most {limit} allowed)", str(longest)
-    return f"longest loss burst (cap M − 1 = {cap})", str(longest)
+    return f"longest loss burst (at most {limit} allowed)", str(longest)
 
 
 def interval_rows(shortest_s: float | None, median_s: float | None, delivered_s: float | None) -> Numbers:

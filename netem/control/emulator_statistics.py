@@ -109,7 +109,7 @@ class DirectionStatistics(TypedDict):
     held_back: int
     longest_loss_burst: int
     mansd: int | None
-    """Maximum of that number (M − 1) that the guarantee allows; null if there is none."""
+    """Maximum of that number that the guarantee allows; null if there is none."""
     constraints: list[str]
     """The further constraints of the guarantee, in words."""
     loss: LossStatistics

@@ -1,6 +1,6 @@
 """The guarantee of a network (MANSD, and the other constraints on losses), as rules.
 
-``native/network/guarantee.c`` enforces it in the emulator. M − 1 is the setting ``mansd`` of a link
+``native/network/guarantee.c`` enforces it in the emulator. Its first rule is the setting ``mansd`` of a link
 (``netem/impairments/link_settings.py``); the settings of the other rules are in
 ``netem/impairments/constraints/``.
 """

@@ -68,7 +68,7 @@ class LongestBurst(LossRule):
 
     @property
     def meaning(self) -> str:
-        return f"at most M − 1 = {self.limit} consecutive losses"
+        return f"at most {self.limit} lost in a row"
 
     def after(self, state: int, lost: bool) -> tuple[int, int]:
         count = state + 1 if lost else 0

@@ -1,6 +1,6 @@
 """The bursts of a link's losses without a guarantee: their mean, and the chance of a longer one.
 
-This is the question by which people choose M: how likely it is that more than M − 1 consecutive packets
+This is the question by which people choose ``mansd``: how likely it is that more packets in a row
 are lost within some number of packets.
 """
 
@@ -29,7 +29,7 @@ class BurstPrediction:
     mean_burst: float | None
     """Mean length of a burst; None: losses never end, or there are none."""
     chance: Mapping[int, float]
-    """By M − 1: the probability that at least one burst is longer."""
+    """By ``mansd``: the probability that at least one burst is longer."""
     note: str = ""
     """Why nothing is known; else empty."""
 
@@ -44,14 +44,14 @@ class BurstPrediction:
 
 
 def caps_with(cap: int | None) -> list[int]:
-    """Return eight values of M − 1, among them the one in force if there is one."""
+    """Return eight values of ``mansd``, among them the one in force if there is one."""
     if not cap or cap in _USUAL_CAPS:
         return list(_USUAL_CAPS)
     return sorted({*_USUAL_CAPS, cap} - {6})
 
 
 def predict_bursts(process: LossProcess, caps: Iterable[int], packets: int) -> BurstPrediction:
-    """Return the prediction for values of M − 1; what cannot be computed is left out, with a note."""
+    """Return the prediction for values of ``mansd``; what cannot be computed is left out, with a note."""
     chance: dict[int, float] = {}
     note = ""
     for cap in caps:

@@ -35,7 +35,7 @@ class LinkSettings(ScenarioSection):
     impairments: tuple[AnyImpairment, ...] = ()
     """The impairments, applied in this order."""
     mansd: Mansd | None = None
-    """M − 1: maximum number of consecutive packets of a flow not effectively delivered."""
+    """At most this number of packets of a flow in a row is not effectively delivered."""
     constraints: Constraints = ()
     """Further constraints on the losses of a flow; with mansd they are the guarantee."""
     first_delivered: bool = False

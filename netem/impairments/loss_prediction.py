@@ -2,7 +2,7 @@
 
 Each random feature is a Markov chain that advances with every packet. Together they are one chain
 with transition matrix P; in each state, a packet is not effectively delivered with probability ℓ.
-Let A = P diag(ℓ), B = P diag(1 − ℓ), m = M − 1 the cap, and v the distribution of the state at a
+Let A = P diag(ℓ), B = P diag(1 − ℓ), m the cap, and v the distribution of the state at a
 delivered packet. Then
 
 * E D = v Σ_{k=1..m} A^k 1 is the expected number of losses before the next delivery, and

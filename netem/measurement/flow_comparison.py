@@ -32,7 +32,7 @@ class MeasuredFlow(NamedTuple):
             "effective_losses": measurement.bursts.losses,
             "loss_rate": self.loss_rate,
             "longest": measurement.bursts.longest,
-            "M": measurement.longest_loss_burst + 1,
+            "mansd": measurement.longest_loss_burst,
             "outages": int(measurement.is_outage.sum()),
             "delay_s": {str(share): value for share, value in measurement.delays.quantiles_s.items()},
             "jitter_s": None if jitter is None else jitter._asdict(),

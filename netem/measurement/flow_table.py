@@ -17,7 +17,7 @@ _HEADS = (
     "packets",
     "lost",
     "longest burst",
-    "M",
+    "in a row, without outages",
     "delay p50 / p99",
     "jitter, max",
 )
@@ -65,7 +65,7 @@ def _row(flow: MeasuredFlow) -> tuple[str, ...]:
         str(len(measurement.trace)),
         f"{measurement.bursts.losses} ({percent(flow.loss_rate)})",
         str(measurement.bursts.longest),
-        str(measurement.longest_loss_burst + 1),
+        str(measurement.longest_loss_burst),
         shown,
         NONE if delays.jitter is None else duration(delays.jitter.largest_s),
     )

@@ -1,4 +1,4 @@
-"""What losses per interval say about a network: loss rate, whether losses come in bursts, a limit of M.
+"""What losses per interval say about a network: loss rate, whether losses come in bursts, how long ones.
 
 The interval of the loss rate is that of a ratio of sums, p = Σl/Σk over the n intervals with l of k
 packets lost (Cochran, Sampling Techniques, 1977, Section 6.3): losses may depend on each other within an

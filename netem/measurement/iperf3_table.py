@@ -10,7 +10,7 @@ from netem.output.result_tables import KEY_VALUE, ResultTable
 from netem.traces.iperf3_report import read_iperf3
 
 _REMARK = (
-    "iperf3 counts losses per interval, not per packet: delays, longest burst, M, models and availability "
+    "iperf3 counts losses per interval, not per packet: delays, longest burst, models and availability "
     "are not in its report. Measure a capture of the same test for these (tcpdump; --sequence-at 8:4)"
 )
 _HEADS = ("stream", "packets", "lost", "longest burst", "jitter, last / max")
@@ -35,7 +35,7 @@ def iperf3_document(path: Path) -> Document:
     direction = "server to client" if report.is_reverse else "client to server"
     blocks: list[Sentence | ResultTable] = [
         Sentence(
-            text=f"{of}{percent(rate)} lost, M is at least {least + 1}",
+            text=f"{of}{percent(rate)} lost, at least {least} in a row",
             role=SentenceRole.VERDICT,
             lead=f"{path}:",
         ),

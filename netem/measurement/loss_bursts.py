@@ -3,7 +3,7 @@
 A packet is effective (``docs/mansd.md``) if it is received within the deadline, before every later
 packet. A receiver that uses only the newest data misses all others.
 
-The statistics of bursts follow: histogram, the M of a quantile, (m, K) table.
+The statistics of bursts follow: histogram, quantiles, (m, K) table.
 """
 
 import math
@@ -122,18 +122,17 @@ WINDOWS = (2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 @dataclass(frozen=True)
-class QuantileM:
-    """The paper's M (at most M − 1 consecutive losses) for a share of bursts or packets."""
+class BurstQuantile:
+    """The largest number of losses in a row for a share of bursts or packets."""
 
     share: float
     bursts: int
-    """Smallest M with at least this share of the loss bursts not longer than M − 1."""
+    """At least this share of the loss bursts is not longer."""
     bursts_confident: int | None
     """The same for the network's bursts, if they are independent, with confidence 95 %; None: too
     few bursts."""
     packets: int
-    """Smallest M such that at least this share of the packets end no more than M − 1 consecutive
-    losses."""
+    """At least this share of the packets ends no longer burst."""
 
 
 def histogram(bursts: LossBursts) -> dict[int, int]:
@@ -142,27 +141,27 @@ def histogram(bursts: LossBursts) -> dict[int, int]:
     return dict(zip(lengths.tolist(), counts.tolist(), strict=True))
 
 
-def quantile_m(bursts: LossBursts, share: float) -> QuantileM:
-    """Return M for a share; without bursts it is 1."""
+def burst_quantile(bursts: LossBursts, share: float) -> BurstQuantile:
+    """Return the largest number of losses in a row for a share; without bursts it is 0."""
     lengths = np.sort(bursts.length)
     count = len(lengths)
     index = math.ceil(share * count - 1e-9)
     # P(at most rank − 1 of the bursts are in the share) ≥ 95 % (Wilks, 1941)
     rank = int(stats.binom.ppf(LEVEL, count, share)) + 1
-    confident = int(lengths[rank - 1]) + 1 if rank <= count else None
-    return QuantileM(
-        share, int(lengths[index - 1]) + 1 if index > 0 else 1, confident, _packet_quantile(bursts, share)
+    confident = int(lengths[rank - 1]) if rank <= count else None
+    return BurstQuantile(
+        share, int(lengths[index - 1]) if index > 0 else 0, confident, _packet_quantile(bursts, share)
     )
 
 
 def _packet_quantile(bursts: LossBursts, share: float) -> int:
-    """Return the smallest M with Σ max(length − (M − 1), 0) ≤ (1 − share) packets."""
+    """Return the smallest N with Σ max(length − N, 0) ≤ (1 − share) packets."""
     allowed_losses = math.floor((1 - share) * bursts.packets + 1e-9)
 
     def is_enough(allowed_burst: int) -> bool:
         return int(np.maximum(bursts.length - allowed_burst, 0).sum()) <= allowed_losses
 
-    return bisect_left(range(bursts.longest), True, key=is_enough) + 1
+    return bisect_left(range(bursts.longest), True, key=is_enough)
 
 
 def most_losses(bursts: LossBursts, windows: Sequence[int], left_out: Flags | None = None) -> dict[int, int]:

@@ -52,9 +52,13 @@ def measurement_document(
         kind="network measured",
         data={**measurement.to_json(), **data},
         blocks=[
-            Sentence(text=f"M = {longest + 1}{also}", role=SentenceRole.VERDICT, lead=f"{measurement.name}:"),
             Sentence(
-                text=f"{where} most M − 1 = {longest} consecutive packets were not effectively delivered.",
+                text=f"at most {longest} lost in a row{also}",
+                role=SentenceRole.VERDICT,
+                lead=f"{measurement.name}:",
+            ),
+            Sentence(
+                text=f"{where} most {longest} packets in a row were not effectively delivered.",
                 role=SentenceRole.REMARK,
                 is_prose=True,
             ),
@@ -82,15 +86,15 @@ def measurement_tables(measurement: NetworkMeasurement) -> Iterator[ResultTable]
         for quantile in measurement.quantiles
     ]
     heads = ("share", "of the bursts", "with 95 % confidence", "of the packets")
-    yield ResultTable("m", f"M: at most M − 1 consecutive losses{suffix}", heads, rows)
+    yield ResultTable("in_a_row", f"lost in a row, at most{suffix}", heads, rows)
     if prediction := measurement.burst_prediction:
         chances = [
             (str(cap), chance_text(chance), str(measurement.longer_bursts(cap)))
             for cap, chance in prediction.chance.items()
         ]
         model = _MODELS[measurement.chosen.fit.model]
-        caption = f"chance of a loss burst longer than M − 1 within {prediction.packets} packets{suffix}"
-        heads = ("M − 1", f"chance, by the preferred model ({model})", "longer bursts in the trace")
+        caption = f"chance of a longer loss burst within {prediction.packets} packets{suffix}"
+        heads = ("lost in a row", f"chance, by the preferred model ({model})", "longer bursts in the trace")
         yield ResultTable("longer", caption, heads, chances)
     if measurement.windows:
         columns = 3 if suffix else 2
@@ -140,7 +144,7 @@ def _numbers(measurement: NetworkMeasurement, suffix: str) -> Iterator[tuple[str
         if outages:
             yield "  rule", measurement.outage_rule.reason
     longest = measurement.longest_loss_burst
-    yield f"M{suffix}", f"{longest + 1} (maximum consecutive losses M − 1: {longest})"
+    yield f"lost in a row, at most{suffix}", str(longest)
     if (fewest := measurement.fewest_deliveries) is not None:
         yield "fewest deliveries between two bursts", str(fewest)
     delays = measurement.delays

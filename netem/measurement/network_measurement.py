@@ -33,22 +33,22 @@ from netem.measurement.chain_fits import MOST_FITTED, ChainFit, ChainFits, FitTe
 from netem.measurement.interval_estimates import LEVEL, IntervalEstimate
 from netem.measurement.loss_bursts import (
     WINDOWS,
+    BurstQuantile,
     Flags,
     LossBursts,
     Outcomes,
-    QuantileM,
+    burst_quantile,
     histogram,
     loss_bursts,
     most_losses,
     outcomes,
-    quantile_m,
 )
 from netem.measurement.outages import OutageFit, OutageRule, find_outages, fit_outages, outages_longer_than
 from netem.traces.packet_trace import PacketTrace
 
 Reals = NDArray[np.float64]
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
-"""Shares of bursts and packets for which an M is given."""
+"""Shares of bursts and packets for which the largest number of losses in a row is given."""
 SHARES = (0.0, 0.05, 0.5, 0.9, 0.95, 0.99, 0.999, 1.0)
 """Shares of the packets for which a delay is given."""
 _MOST_LAGS, _LARGEST_LAG = 40, 1000
@@ -165,7 +165,7 @@ class MeasurementOptions:
     deadline_s: float | None = None
     """A packet that arrives later than this after its sending counts as lost."""
     quantiles: Sequence[float] = QUANTILES
-    """Shares of bursts and packets for which M is given."""
+    """Shares of bursts and packets for which the largest number of losses in a row is given."""
     windows: Sequence[int] = WINDOWS
     """K of the (m, K) table."""
     outage_s: float | None = None
@@ -273,16 +273,16 @@ class NetworkMeasurement:
 
     @cached_property
     def longest_loss_burst(self) -> int:
-        """The longest burst that is no outage; with it, the network has M − 1."""
+        """The longest burst that is no outage; its length is the network's ``mansd``."""
         return self.bursts.subset(~self.is_outage).longest
 
     @cached_property
-    def quantiles(self) -> list[QuantileM]:
-        """M for shares of bursts and packets, without the outages."""
+    def quantiles(self) -> list[BurstQuantile]:
+        """The losses in a row for shares of bursts and packets, without the outages."""
         usual = self.bursts.subset(~self.is_outage)
         packets = usual.packets - int(self.bursts.length[self.is_outage].sum())
         usual = LossBursts(packets, usual.first, usual.length)
-        return [quantile_m(usual, share) for share in self.options.quantiles]
+        return [burst_quantile(usual, share) for share in self.options.quantiles]
 
     @cached_property
     def windows(self) -> dict[int, WindowLosses]:
@@ -340,7 +340,7 @@ class NetworkMeasurement:
         start, delivers, loses = rates.matrices()
         lost = np.array([rates.loss_in_good, rates.loss_in_bad])
         process = LossProcess(start, delivers + loses, lost, first_delivered=False)
-        caps = {*caps_with(self.longest_loss_burst), *(quantile.bursts - 1 for quantile in self.quantiles)}
+        caps = {*caps_with(self.longest_loss_burst), *(quantile.bursts for quantile in self.quantiles)}
         return predict_bursts(process, sorted(caps - {0}), self._predicted_packets)
 
     @cached_property
@@ -410,7 +410,9 @@ class NetworkMeasurement:
         if cut.any():
             remarks.append("a loss burst is cut by the beginning or end of the trace")
         if self.is_outage.any():
-            remarks.append("outages are reported as such: M and the loss models do not include them")
+            remarks.append(
+                "outages are reported as such: the losses in a row and the loss models do not include them"
+            )
             if self.options.outage_s is None and self.models["gilbert_elliott"].test.verdict == "rejected":
                 remarks.append(
                     "the fitted chain is itself rejected by its test: what counts as an outage "
@@ -434,7 +436,7 @@ class NetworkMeasurement:
             "longest": self.burst_json(int(lengths.argmax())) if len(lengths) else None,
             "outages": [*map(self.burst_json, np.flatnonzero(self.is_outage).tolist())],
             "outage_rule": self.outage_rule.reason,
-            "M": self.longest_loss_burst + 1,
+            "mansd": self.longest_loss_burst,
             "mean_burst": self.mean_burst,
             "bursts_by_preferred_model": self.burst_prediction and self.burst_prediction.to_json(),
             "quantiles": [asdict(quantile) for quantile in self.quantiles],

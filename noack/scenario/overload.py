@@ -1,6 +1,6 @@
 """Whether a link can carry what the guarantee makes it carry; if not, the scenario is refused.
 
-Of any M successive datagrams of a loop, one must pass (M − 1 = the longest burst of losses); a
+Of any N + 1 successive datagrams of a loop, one must pass (N: the longest burst of losses); a
 constraint can require more, at least K − m of any K. What must pass is queued even if the queue is
 full. So the queue grows without bound if these datagrams need more than the link's rate, or more
 slots than a schedule has, although each loop transmits as rarely as its trigger allows. Only

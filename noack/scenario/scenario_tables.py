@@ -125,7 +125,10 @@ class ScenarioTables(ScenarioRoot):
             ("mode", self.between_updates),
             ("plant", f"{self.plant.system.kind}, n = {n}, m = {m}, {self.plant.rate_hz:g} Hz"),
             ("trigger", _section_text(self.trigger, "policy")),
-            ("network", f"{_section_text(self.network.loss, 'model')}; M − 1 = {self.network.mansd}"),
+            (
+                "network",
+                f"{_section_text(self.network.loss, 'model')}; at most {self.network.mansd} lost in a row",
+            ),
             ("horizon", f"{self.horizon_s:g} s"),
         ]
         if self.loops:

@@ -496,7 +496,7 @@ class NetworkSection(DirectionSection):
     """The lossy network between sensor and controller."""
 
     mansd: Mansd
-    """M − 1, the maximum of consecutive losses (MANSD); for the paper's M = 5 it is 4."""
+    """At most this number of packets is lost in a row (MANSD); for the paper's M = 5 it is 4."""
     loss: Loss
     """Loss of updates, before the guarantee is applied."""
     enforce_mansd: bool = True

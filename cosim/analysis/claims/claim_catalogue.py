@@ -31,7 +31,7 @@ _SMALLEST_NORMAL = float(np.finfo(float).tiny)
 """Smaller numbers have fewer digits: rounding may change them by a multiple."""
 _COMPLETE = "a complete record"
 _CONTINUOUS = "a continuous trigger, a network without delay"
-_CAPPED = "at most M − 1 consecutive losses"
+_CAPPED = "at most mansd lost in a row"
 _IDEAL = f"a continuous trigger, a network and input without delay, {_CAPPED}"
 
 

@@ -328,7 +328,7 @@ def _cause(text: str) -> str:
 
 
 def _largest_mansd(record: RunRecord, since_ns: int) -> int:
-    """The largest M − 1 in force at any time from ``since_ns`` on."""
+    """The largest ``mansd`` in force at any time from ``since_ns`` on."""
     changes = changes_of(record)
     caps = [record.scenario.network.mansd, *(change.scenario.network.mansd for change in changes)]
     ends_ns = [*(change.everywhere_ns for change in changes), NEVER_NS]

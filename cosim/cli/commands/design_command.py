@@ -53,7 +53,7 @@ class CertificateConditions(StrEnum):
             "noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json",
             "with another gain",
         ),
-        ("noack design lane_periodic --for network", "a gain for the largest M"),
+        ("noack design lane_periodic --for network", "a gain for the most losses in a row"),
         (
             "noack design unstable_pendulum --for network --period 0.25 --out mine.toml",
             "for a time-triggered loop",
@@ -69,7 +69,7 @@ def design(
         Option(
             "--for",
             help="`settling`: the trigger with the fewest transmissions that settles in time. "
-            "`network`: the gain of a time-triggered loop that is proven stable for the largest M.",
+            "`network`: the gain with which a time-triggered loop bears the most losses in a row, proven.",
         ),
     ] = DesignAim.SETTLING,
     settling: Annotated[
@@ -114,7 +114,7 @@ def design(
     ] = None,
     most: Annotated[
         int | None,
-        Option(min=1, max=10_000, help="With --for network: largest M to examine; 16 by default."),
+        Option(min=0, max=9_999, help="With --for network: most losses in a row to examine; 15 by default."),
     ] = None,
     cost: Annotated[
         float | None,

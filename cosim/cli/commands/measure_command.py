@@ -1,4 +1,4 @@
-"""``noack measure``: losses, delays and the M of a real network."""
+"""``noack measure``: losses and delays of a real network."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -105,7 +105,7 @@ def measure(
         list[str] | None,
         Option(
             metavar="SHARE",
-            help="Share of loss bursts and packets for which M is given, e.g. 99%; repeatable.",
+            help="Share of bursts and packets for which the losses in a row are given, e.g. 99%; repeatable.",
         ),
     ] = None,
     window: Annotated[
@@ -168,7 +168,7 @@ def measure(
     width: opt.WidthOption = None,
     json: opt.JsonOption = False,
 ) -> None:
-    """Measure a network: losses, bursts, M, delays, outages, and models that fit.
+    """Measure a network: losses, bursts, delays, outages, and models that fit.
 
     Takes some seconds.
     """

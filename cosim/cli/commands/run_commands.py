@@ -55,7 +55,7 @@ def demo(
     epilog=examples(
         ("noack run lane_following", "the paper's example, 20 s"),
         ("noack run unstable_pendulum --set horizon_s=5 --live", "5 s, with the live viewer"),
-        ("noack run lane_following --set network.mansd=9 --json", "M − 1 = 9; print JSON"),
+        ("noack run lane_following --set network.mansd=9 --json", "at most 9 lost in a row; print JSON"),
     ),
 )
 def run(
@@ -138,7 +138,7 @@ def simulate(
     epilog=examples(
         ("noack set", "list the runtime parameters and their values"),
         ("noack set loss.p 0.9", "lose nine in ten packets from now on"),
-        ("noack set mansd 2 trigger.beta 0.3 --json", "change M − 1 and β at once"),
+        ("noack set mansd 2 trigger.beta 0.3 --json", "at most 2 lost in a row, and another β, at once"),
     ),
 )
 def set_(

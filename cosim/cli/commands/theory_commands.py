@@ -289,7 +289,7 @@ def _certificate_to_compare(resolved: "Scenario") -> "ScenarioCertificate":
 @app.command(
     rich_help_panel=THEORY,
     epilog=examples(
-        ("noack margin lane_periodic", "the largest M and the longest period"),
+        ("noack margin lane_periodic", "how many lost in a row, and the longest period"),
         ("noack margin lane_periodic --play", "play the destabilising pattern live"),
         ('noack margin lane_periodic --guarantee "atmost 5 in 9"', "compare two guarantees"),
         ("noack margin lane_periodic --set mode=zoh --no-period --json", "hold the input; as JSON"),
@@ -300,12 +300,12 @@ def margin(
     settings: opt.SetOption = None,
     network: opt.NetworkOption = None,
     loop: opt.LoopOption = None,
-    most: Annotated[int, Option(help="Largest M to examine, 1 to 1000.")] = 16,
+    most: Annotated[int, Option(help="Largest number of losses in a row to examine, 0 to 999.")] = 15,
     accuracy: Annotated[
         float, Option(help="Wanted ratio of the bounds, minus 1; finer where they include 1.")
     ] = 4e-3,
     period: Annotated[
-        bool, Option(help="Search for the longest period with the scenario's own M, too.")
+        bool, Option(help="Search for the longest period with the scenario's own guarantee, too.")
     ] = True,
     guarantee: Annotated[
         list[str] | None,
@@ -331,17 +331,17 @@ def margin(
     tables: opt.TablesOption = None,
     json: opt.JsonOption = False,
 ) -> int:
-    """Find the largest M for which a loop is stable under every loss pattern.
+    """Find how many packets may be lost in a row while a loop is stable under every loss pattern.
 
     The trigger policy must have a longest time between two events, as periodic and deadline have.
     The verdict holds for all times of events that the policy allows. Exit status 1: the loop is not
-    proven stable for any M.
+    proven stable even without losses.
 
     --play takes the scenario's horizon, or a longer one, up to 10 minutes, at which the growth of
     ‖x‖ shows, and prints what to expect.
 
-    Takes a second of CPU time for each M, and minutes if the times of events vary, as with a deadline. The
-    search for the longest period adds some seconds. Each result is printed when it is known.
+    Takes a second of CPU time for each number of losses, and minutes if the times of events vary, as with a
+    deadline. The search for the longest period adds some seconds. Each result is printed when it is known.
     """
     from cosim.analysis.margin_search import find_margin
     from cosim.output.certificate_report import margin_document
@@ -359,7 +359,7 @@ def margin(
         result = find_margin(
             resolve(opt.load_loop(scenario, settings, loop, network)),
             on_stop=stops.append,
-            most_m=most,
+            most_mansd=most,
             accuracy=accuracy,
             with_period=period,
             guarantees=guarantee or (),
@@ -378,9 +378,9 @@ def margin(
         print_to_stderr(f"noack: {stops[0]}; missing: {', '.join(result.missing)}")
         return stops[0].exit_status
     if not play:
-        return ExitStatus.OK if result.stable_m else ExitStatus.FAILED
+        return ExitStatus.OK if result.stable_mansd is not None else ExitStatus.FAILED
     if (pattern := result.destabilised) is None:
-        raise CallerError(f"--play: no destabilising pattern was found for M up to {most}")
+        raise CallerError(f"--play: no destabilising pattern was found with up to {most} lost in a row")
     if result.ties:
         raise CallerError(f"--play: no run can choose the ticks of the pattern: {result.ties}")
     from cosim.cli.execute_run import run_processes

@@ -293,7 +293,7 @@ class LoopView:
     def add_deliveries(self, t_ns: Times, interval_s: Reals, forced: npt.NDArray[np.bool_]) -> None:
         """Add deliveries: times (k,), seconds since the previous one (k,), forced (k,).
 
-        A delivery is forced if M − 1 consecutive updates were lost before it. An interval that is
+        A delivery is forced if ``mansd`` updates in a row were lost before it. An interval that is
         NaN is drawn as 0.
         """
         interval_s = np.nan_to_num(interval_s)

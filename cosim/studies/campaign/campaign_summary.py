@@ -45,7 +45,7 @@ class GridPointResult(NamedTuple):
     """Number of runs in which ‖e_c‖ exceeds its certified bound: an error in the theory or the
     code."""
     bursts: BurstFrequency | None
-    """How often a burst was longer than M − 1; None if the network enforces the guarantee."""
+    """How often a burst was longer than ``mansd``; None if the network enforces the guarantee."""
 
 
 class ComparedResult(NamedTuple):

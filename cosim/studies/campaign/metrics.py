@@ -3,7 +3,7 @@
 Means have Student's confidence intervals, ± t s/√k. Mean and interval use the finite values only.
 The median's interval uses order statistics (binomial, for any distribution). It includes infinite
 values: a run that never settles counts as later than all others. Beside the metrics are the
-certified bound of ‖e_c‖, and how often runs exceed M − 1 consecutive losses if the network does not
+certified bound of ‖e_c‖, and how often runs exceed ``mansd`` losses in a row if the network does not
 enforce the guarantee.
 """
 
@@ -258,10 +258,10 @@ def interval_ranks(count: int, share: float) -> tuple[int, int]:
 
 
 class BurstFrequency(NamedTuple):
-    """Runs with a burst of more than M − 1 losses, and their predicted share."""
+    """Runs with a burst of more than ``mansd`` losses, and their predicted share."""
 
     most: int
-    """M − 1."""
+    """``mansd``."""
     runs: int
     longer: int
     """Number of runs with a longer burst."""
@@ -279,7 +279,7 @@ class BurstFrequency(NamedTuple):
         return (
             f"{self.longer:,} of {self.runs:,} runs ({100 * self.longer / self.runs:.3g} %, "
             f"interval {100 * self.low:.3g} to {100 * self.high:.3g} %) had a burst longer than "
-            f"M − 1 = {self.most}; at most {100 * self.predicted:.3g} % are expected, since no run "
+            f"{self.most}; at most {100 * self.predicted:.3g} % are expected, since no run "
             f"sent more than {self.packets:,} packets"
         )
 

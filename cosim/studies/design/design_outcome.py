@@ -108,8 +108,8 @@ def network_outcome(search: NetworkSearch, given: CertifiedLoop, best: Certified
         given=_loop_result(search, given),
         best=_loop_result(search, best),
         notes=list(_notes(search)),
-        scenario=search.scenario_of(best.K, best.m),
-        is_certified=best.m > 0,
+        scenario=search.scenario_of(best.K, best.mansd),
+        is_certified=best.mansd >= 0,
         is_better=best.K != given.K,
         document={"cost_limit": search.cost_limit, "tried": search.tried, "examined": search.examined},
         figure=_growth_figure(search, given, best),
@@ -118,7 +118,9 @@ def network_outcome(search: NetworkSearch, given: CertifiedLoop, best: Certified
 
 def _loop_result(search: NetworkSearch, loop: CertifiedLoop) -> LoopResult:
     proven, share = loop.stability, 1 / search.measurements
-    reach = f"M = {loop.m}{', the most examined' * (loop.m == search.most)}" if loop.m else "nothing proven"
+    reach = "nothing proven"
+    if loop.mansd >= 0:
+        reach = f"at most {loop.mansd} lost in a row{', the most examined' * (loop.mansd == search.most)}"
     growth = (
         f"{at_least(proven.lower, decimals=5)} to {at_most(proven.upper, decimals=5)}" if proven else NONE
     )
@@ -130,7 +132,7 @@ def _loop_result(search: NetworkSearch, loop: CertifiedLoop) -> LoopResult:
         "share of measurements sent": f"{100 * share:.3g} %",
         "K": _gain_text(loop.K),
     }
-    document: dict[str, object] = {"certified": loop.m or None, "cost": loop.cost}
+    document: dict[str, object] = {"certified": loop.mansd if loop.mansd >= 0 else None, "cost": loop.cost}
     document |= {"transmitted": share, "K": loop.K}
     for name, stability in (("stability", proven), ("beyond", loop.beyond)):
         document[name] = stability and stability.to_json()
@@ -158,15 +160,16 @@ def _beyond_text(loop: CertifiedLoop) -> str:
     if loop.beyond is None:
         return "not examined"
     destabilised = loop.beyond.verdict == "destabilised"
-    return f"M = {loop.m + 1}: {f'{loop.beyond.text} destabilises' if destabilised else 'undecided'}"
+    outcome = f"{loop.beyond.text} destabilises" if destabilised else "undecided"
+    return f"{loop.mansd + 1} lost in a row: {outcome}"
 
 
 def _growth_figure(search: NetworkSearch, given: CertifiedLoop, best: CertifiedLoop) -> PageFigure:
-    """Return the growth of both loops over M."""
-    numbers = np.arange(1, min(max(best.m, given.m) + 4, search.most) + 1)
+    """Return the growth of both loops over the losses in a row."""
+    numbers = np.arange(min(max(best.mansd, given.mansd) + 4, search.most) + 1)
     loops = ((given, "given", palette.NETWORK), (best, "designed", palette.LOST))
     growth = {
-        label: np.exp(np.minimum([search.growth(loop.K, int(m)) for m in numbers], 1.1))
+        label: np.exp(np.minimum([search.growth(loop.K, int(mansd)) for mansd in numbers], 1.1))
         for loop, label, _ in loops
     }
 
@@ -176,10 +179,10 @@ def _growth_figure(search: NetworkSearch, given: CertifiedLoop, best: CertifiedL
             draw_line(axes, numbers.astype(float), growth[label], colour, label=label, marker="o")
             if loop.stability is not None:
                 axes.plot(
-                    loop.m, loop.stability.upper, "*", color=rgb(colour), markersize=12,
+                    loop.mansd, loop.stability.upper, "*", color=rgb(colour), markersize=12,
                     label=f"{label}: proven",
                 )  # fmt: skip
-        axes.set(xlabel="M", ylabel="growth per period")
+        axes.set(xlabel="lost in a row, at most", ylabel="growth per period")
         whole_numbers(axes, "x")
 
     return one_panel("growth", HEIGHT_IN, draw, caption=_GROWTH_CAPTION)
@@ -188,7 +191,9 @@ def _growth_figure(search: NetworkSearch, given: CertifiedLoop, best: CertifiedL
 def design_for_network(
     scenario: Scenario, request: DesignRequest, progress: Progress = no_progress
 ) -> DesignOutcome:
-    """Search for the gain of a time-triggered loop that tolerates the largest M; it is deterministic.
+    """Search for the gain with which a time-triggered loop tolerates the most losses in a row.
+
+    The search is deterministic.
 
     Raises:
         CallerError: the scenario does not permit it, or a request is out of range.

@@ -1,12 +1,12 @@
 """The search for a gain that tolerates the most losses.
 
-The sensor is time-triggered. A loop *tolerates M* if every loss pattern with at most M − 1
+The sensor is time-triggered. A loop *tolerates N losses in a row* if every loss pattern with at most N
 consecutive losses (and the network's further constraints) is proven stable.
 
 1. The given loop is examined; regulators (LQR) over a grid of weights are the further starts.
-2. A quick lower bound of the growth (``quick_estimate.py``) excludes loops that cannot tolerate an
-   M. Of the others the margin is computed: its certified upper bound must be below 1.
-3. From the best starts, the lower bound for the next M is minimised over K without gradients
+2. A quick lower bound of the growth (``quick_estimate.py``) excludes loops that cannot tolerate a
+   number. Of the others the margin is computed: its certified upper bound must be below 1.
+3. From the best starts, the lower bound for the next number is minimised over K without gradients
    (Nelder and Mead). As soon as it is below 1, the margin of the loop is computed, and the search
    aims higher.
 """
@@ -35,8 +35,8 @@ from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
 COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
 """Factors of R of the regulators that the search begins with."""
-MOST_M = 16
-"""Largest M that is examined by default."""
+MOST_MANSD = 15
+"""Largest number of losses in a row that is examined by default."""
 _SLACK = 0.002
 """The search wants log growth below −_SLACK: the margin of a loop at the limit takes long."""
 _STARTS = 4
@@ -51,8 +51,8 @@ _UNSTABLE = 1e3
 class DesignRequest:
     """What a design is asked for."""
 
-    most: int = MOST_M
-    """Largest M to examine."""
+    most: int = MOST_MANSD
+    """Largest number of losses in a row to examine."""
     period_s: float | None = None
     """Time between updates; None: the scenario's."""
     cost: float = 1.2
@@ -64,15 +64,15 @@ class DesignRequest:
 
 
 class CertifiedLoop(NamedTuple):
-    """A gain with the largest M that the loop is proven to tolerate."""
+    """A gain with the most losses in a row that the loop is proven to tolerate."""
 
     K: MatrixRows
-    m: int
-    """M; 0: nothing is proven."""
+    mansd: int
+    """At most this number of packets is lost in a row; −1: nothing is proven, even without losses."""
     stability: Stability | None
     """The certificate for it; None: there is none."""
     beyond: Stability | None
-    """What is known about M + 1; None: it was not examined."""
+    """What is known with one more loss in a row; None: it was not examined."""
     cost: float
     """Without losses; infinite: the loop is unstable then."""
 
@@ -126,9 +126,9 @@ class NetworkSearch:
                 f'trigger.policy = "{scenario.trigger.policy}": the search is for periodic '
                 "updates; give their --period"
             )
-        # Above the bursts that the constraints allow, M means nothing.
+        # More losses in a row than the constraints allow mean nothing.
         burst = uncapped(resolved.network.guarantee).longest_burst
-        self.most = request.most if burst is None else min(request.most, burst + 1)
+        self.most = request.most if burst is None else min(request.most, burst)
         n, m = self.plant.n, self.plant.m
         self.weights = request.weights or (np.eye(n), np.eye(m))
         weighed_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
@@ -138,9 +138,9 @@ class NetworkSearch:
         self.tried = self.examined = 0
         self._graph = cache(self._new_graph)
 
-    def guarantee(self, m: int) -> LossGuarantee:
-        """Return the guarantee for an M, with the network's further constraints."""
-        return capped(self.scenario.network.guarantee, m - 1)
+    def guarantee(self, mansd: int) -> LossGuarantee:
+        """Return the guarantee with another limit, and the network's further constraints."""
+        return capped(self.scenario.network.guarantee, mansd)
 
     def quick_loop(self, K: MatrixRows) -> QuickLoop:
         """Return the loop of a gain in double precision."""
@@ -150,113 +150,114 @@ class NetworkSearch:
             H = np.zeros_like(H)
         return QuickLoop((plant.A, plant.B, gain, H), self._times, self.weights, self._latest)
 
-    def _new_graph(self, m: int) -> PatternGraph:
-        """Return the loss patterns for an M, which keep those that were the worst."""
-        guarantee = checked_guarantee(self.guarantee(m))
+    def _new_graph(self, mansd: int) -> PatternGraph:
+        """Return the loss patterns of a limit, which keep those that were the worst."""
+        guarantee = checked_guarantee(self.guarantee(mansd))
         return PatternGraph(list_bursts(guarantee, self._loop.times, self._loop.between))
 
-    def growth(self, K: MatrixRows, m: int) -> float:
+    def growth(self, K: MatrixRows, mansd: int) -> float:
         """Return a lower bound of the logarithm of the growth per period."""
         self.tried += 1
-        graph = self._graph(m)
+        graph = self._graph(mansd)
         return graph.growth(self.quick_loop(K).maps(graph.bursts))
 
     def cost(self, K: MatrixRows) -> float:
         """Return the cost without losses."""
         return self.quick_loop(K).cost(self.plant.x0)
 
-    def excess(self, K: MatrixRows, m: int) -> float:
+    def excess(self, K: MatrixRows, mansd: int) -> float:
         """Return what is minimised: the growth, and by how much the cost exceeds its limit."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             plant = self.plant
             rate_per_s = spectral_abscissa(plant.A_model + plant.B_model @ np.array(K))
             if not rate_per_s < 0:
                 return _UNSTABLE + min(rate_per_s, _UNSTABLE)
-            cost, growth = self.cost(K), self.growth(K, m)
+            cost, growth = self.cost(K), self.growth(K, mansd)
             if not math.isfinite(cost) or not math.isfinite(growth):
                 return _UNSTABLE / 2 + min(max(growth, 0.0), _UNSTABLE / 4)
         if cost <= self.cost_limit:
             return growth
         return max(growth, -_SLACK) + _SLACK + math.log(cost / self.cost_limit)
 
-    def largest_possible(self, K: MatrixRows, m: int) -> tuple[int, float]:
-        """Return the largest M from the given one on that is not excluded, and the excess for the next."""
-        while m <= self.most:
-            if (excess := self.excess(K, m)) >= -_SLACK:
-                return m - 1, excess
-            m += 1
+    def largest_possible(self, K: MatrixRows, mansd: int) -> tuple[int, float]:
+        """Return the largest limit from the given one on that is not excluded, and the excess of the next."""
+        while mansd <= self.most:
+            if (excess := self.excess(K, mansd)) >= -_SLACK:
+                return mansd - 1, excess
+            mansd += 1
         return self.most, -math.inf
 
-    def scenario_of(self, K: MatrixRows, m: int) -> Scenario:
-        """Return the scenario of a gain with the guarantee for an M, not resolved."""
+    def scenario_of(self, K: MatrixRows, mansd: int) -> Scenario:
+        """Return the scenario of a gain with a limit of the losses in a row, not resolved."""
         scenario = self.scenario
         model = scenario.model.model_copy(update={"gain": K})
-        network = scenario.network.model_copy(update={"mansd": max(m, 1) - 1})
+        network = scenario.network.model_copy(update={"mansd": max(mansd, 0)})
         return scenario.model_copy(update={"model": model, "network": network})
 
-    def stability(self, K: MatrixRows, m: int) -> Stability:
-        """Return the certified bounds of a loop for an M."""
+    def stability(self, K: MatrixRows, mansd: int) -> Stability:
+        """Return the certified bounds of a loop with a limit of the losses in a row."""
         self.examined += 1
-        margin = LossMargin(resolve(self.scenario_of(K, m)))
+        margin = LossMargin(resolve(self.scenario_of(K, mansd)))
         stability = margin.first_bounds()
         return margin.coarse_bounds() if stability.verdict == "undecided" else stability
 
     def largest_certified(self, K: MatrixRows, most: int, least: int) -> int:
-        """Return the largest certified M from ``most`` down to above ``least``; else ``least``."""
-        return next((m for m in range(most, least, -1) if self.stability(K, m).verdict == "stable"), least)
+        """Return the largest certified limit from ``most`` down to above ``least``; else ``least``."""
+        limits = range(most, least, -1)
+        return next((mansd for mansd in limits if self.stability(K, mansd).verdict == "stable"), least)
 
     def certify(self, K: MatrixRows, most: int) -> CertifiedLoop:
-        """Return a loop with refined bounds for the largest certified M and for the next one."""
-        m, stability, beyond = most, None, None
-        while m > 0 and (stability := self.stability(K, m)).verdict != "stable":
-            m, stability = m - 1, None
-        while m < self.most:
-            beyond = self.stability(K, m + 1)
+        """Return a loop with refined bounds for the largest certified limit and for the next one."""
+        mansd, stability, beyond = most, None, None
+        while mansd >= 0 and (stability := self.stability(K, mansd)).verdict != "stable":
+            mansd, stability = mansd - 1, None
+        while mansd < self.most:
+            beyond = self.stability(K, mansd + 1)
             if beyond.verdict != "stable":
                 break
-            m, stability, beyond = m + 1, beyond, None
-        return CertifiedLoop(K, m, stability, beyond, self.cost(K))
+            mansd, stability, beyond = mansd + 1, beyond, None
+        return CertifiedLoop(K, mansd, stability, beyond, self.cost(K))
 
     def run(self, progress: Progress = no_progress) -> tuple[CertifiedLoop, CertifiedLoop]:
         """Return what the given loop is proven to tolerate, and the best loop found."""
         # The given loop, which the others must exceed.
-        given = self.certify(self.given_gain, self.largest_possible(self.given_gain, 1)[0])
-        self.tried, best, best_m = 0, given.K, given.m
+        given = self.certify(self.given_gain, self.largest_possible(self.given_gain, 0)[0])
+        self.tried, best, best_mansd = 0, given.K, given.mansd
         progress(0.1)
-        # Rank the starts by the M that is not excluded, then by the excess for the next one.
+        # Rank the starts by the limit that is not excluded, then by the excess of the next one.
         plant, (Q, R) = self.plant, self.weights
         starts = [round_gain(weighed_gain(plant.A_model, plant.B_model, Q, c * R)) for c in COSTS_OF_INPUT]
         ranked = sorted(
-            ((*self.largest_possible(K, max(best_m, 1)), K) for K in [given.K, *starts]),
+            ((*self.largest_possible(K, max(best_mansd, 0)), K) for K in [given.K, *starts]),
             key=lambda entry: (-entry[0], entry[1]),
         )[:_STARTS]
         for most, _, K in ranked:
-            if (m := self.largest_certified(K, most, best_m)) > best_m:
-                best, best_m = K, m
+            if (mansd := self.largest_certified(K, most, best_mansd)) > best_mansd:
+                best, best_mansd = K, mansd
         progress(0.3)
         # The gains that are improved, each with an equal share of the effort.
         pool = list(dict.fromkeys([best, *(K for _, _, K in ranked)]))
         share = max(self.request.effort // len(pool), 1)
         for number, K in enumerate(pool):
-            # Improve until the next M is not excluded and certified, then aim at the one after it.
+            # Improve until the next limit is not excluded and certified, then aim at the one after it.
             tries_left = share
-            while tries_left > 0 and best_m < self.most:
+            while tries_left > 0 and best_mansd < self.most:
                 tried_before = self.tried
-                better = self._improve(K, best_m + 1, tries_left)
+                better = self._improve(K, best_mansd + 1, tries_left)
                 tries_left -= max(self.tried - tried_before, 1)
                 if better is None:
                     break
                 K = better
-                most, _ = self.largest_possible(K, best_m + 1)
-                m = self.largest_certified(K, max(most, best_m + 1), best_m)
-                if m == best_m:
+                most, _ = self.largest_possible(K, best_mansd + 1)
+                mansd = self.largest_certified(K, max(most, best_mansd + 1), best_mansd)
+                if mansd == best_mansd:
                     break
-                best, best_m = K, m
+                best, best_mansd = K, mansd
             progress(0.3 + 0.6 * (number + 1) / len(pool))
-        return given, given if best == given.K else self.certify(best, best_m)
+        return given, given if best == given.K else self.certify(best, best_mansd)
 
-    def _improve(self, start: MatrixRows, m: int, most_tries: int) -> MatrixRows | None:
-        """Return a gain near ``start`` whose lower bound for an M is below 1; None: none found.
+    def _improve(self, start: MatrixRows, mansd: int, most_tries: int) -> MatrixRows | None:
+        """Return a gain near ``start`` whose lower bound with a limit is below 1; None: none found.
 
         It is searched by the method of Nelder and Mead, Computer Journal 7(4), 1965.
         """
@@ -269,7 +270,7 @@ class NetworkSearch:
             return round_gain(K + units * steps.reshape(K.shape))
 
         def excess(steps: Vector) -> float:
-            return self.excess(gain_at(steps), m)
+            return self.excess(gain_at(steps), mansd)
 
         def stop_early(intermediate_result: OptimizeResult) -> None:
             if intermediate_result.fun < -_SLACK:

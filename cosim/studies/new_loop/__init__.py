@@ -13,6 +13,6 @@ ALPHA_SHARE = 0.5
 HORIZON_DECAY = 0.01
 """The horizon is the time in which e^(−αt) falls to this."""
 DEFAULT_MANSD = 4
-"""M − 1, the maximum number of consecutive losses; less if nothing is certified with it."""
+"""The largest number of losses in a row; less if nothing is certified with it."""
 DEFAULT_LOSS_PROBABILITY = 0.5
 """Loss probability of an update before this maximum is applied."""

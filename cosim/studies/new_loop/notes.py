@@ -48,7 +48,7 @@ def loop_notes(
         pass
     elif not certificate.has("x"):
         yield (
-            f"No certificate was found for {plant}: {certificate.void}. Rates, gains and M were "
+            f"No certificate was found for {plant}: {certificate.void}. Rates, gains and mansd were "
             "tried; noack certify tries other settings, and names those with a certificate."
         )
     else:

@@ -22,7 +22,7 @@ _COMMENTS = {
     "trigger.beta": "The first threshold. Larger: fewer transmissions, larger errors.",
     "trigger.floor": "The last threshold. With 0, x converges to 0.",
     "trigger.weight": "W of the norm ‖W e‖ of errors, chosen for the certificate.",
-    "network.mansd": "Maximum consecutive losses, M − 1. The network delivers the next packet.",
+    "network.mansd": "At most this number of packets is lost in a row. The network delivers the next one.",
     "network.loss": "Losses, before this limit is applied.",
     "seeds": "Another number: other losses.",
     "outputs": "What you want to know, in its own unit, and how far it may be from its set-point.",

@@ -50,7 +50,7 @@ class LossyChannel(
     Rewards and ends of episodes do not cross the network. ``reset`` returns the first observation
     itself, which is also the first packet.
 
-    Each direction has the guarantee of the network, e.g. at most M − 1 consecutive losses. Losses
+    Each direction has the guarantee of the network, e.g. at most ``mansd`` losses in a row. Losses
     are those of a run of noack with the same ``seeds.loss``, packet by packet; each further episode
     has others. ``reset(seed=...)`` sets this seed and begins again.
 

@@ -57,7 +57,7 @@ class Explorer:
 
     @cached_property
     def margin(self) -> str:
-        """For which M the loop is stable under every loss pattern; this may take minutes."""
+        """With how many losses in a row the loop is stable for every pattern; this may take minutes."""
         return results.margin_of(self.scenario)
 
     def set(self, settings: Mapping[str, object]) -> None:

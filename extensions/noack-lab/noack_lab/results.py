@@ -197,7 +197,7 @@ def kept_line(run: ShownRun, guarantee: Guarantee) -> VerdictText:
 
 
 def margin_of(scenario: noack.Scenario) -> str:
-    """Return for which M the loop is stable under every loss pattern; this may take minutes."""
+    """Return with how many losses in a row the loop is stable for every pattern; this may take minutes."""
     try:
         return str(noack.margin(scenario, accuracy=_MARGIN_ACCURACY, period=False).verdict)
     except noack.NoackError as error:

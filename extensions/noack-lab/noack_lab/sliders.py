@@ -39,7 +39,7 @@ POLICIES: Mapping[str, Mapping[str, object]] = {
 """The trigger policies that are offered, with their first settings."""
 _LABELS = {
     "network.loss.probability": "loss probability",
-    "network.mansd": "maximum consecutive losses (M − 1)",
+    "network.mansd": "lost in a row, at most",
     "trigger.alpha_per_s": "α, decay of the threshold [1/s]",
     "trigger.beta": "β, threshold at the start",
     "trigger.floor": "ε, smallest threshold",

@@ -39,7 +39,7 @@ def test_settings_change_the_results_and_wrong_ones_change_nothing() -> None:
 def test_a_saved_scenario_has_the_settings_and_the_comments(tmp_path: Path) -> None:
     path = noack_lab.explore("lane_following", {"trigger.beta": 0.125}).save(tmp_path / "mine.toml")
     assert noack.load(path).trigger.beta == 0.125
-    assert "# M - 1: at most four consecutive losses" in path.read_text()
+    assert "# at most four packets are lost in a row" in path.read_text()
 
 
 def test_several_loops_are_refused() -> None:

@@ -29,7 +29,7 @@ def test_any_value_at_any_place_is_read_back(key: str, value: object) -> None:
 
 def test_a_change_keeps_the_comments_and_a_mistake_is_said_with_its_key() -> None:
     draft = LANE.with_value("trigger.beta", 0.125).with_value("network.mansd", 2)
-    assert "# M - 1: at most" in draft.text
+    assert "# at most four" in draft.text
     assert (draft.scenario.trigger.beta, draft.scenario.network.mansd) == (0.125, 2)
     with pytest.raises(noack.NoackError, match=r"trigger\.beta = -1"):
         _ = draft.with_value("trigger.beta", -1.0).scenario

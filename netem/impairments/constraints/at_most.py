@@ -23,7 +23,7 @@ class AtMost(Constraint):
         Clause(
             "atmost",
             "atmost 3 in 10",
-            Part("losses", COUNT, "M"),
+            Part("losses", COUNT, "N"),
             Part("window", COUNT, "K", "in", "atmost 3 in 10"),
         ),
     )

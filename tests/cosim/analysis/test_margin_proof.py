@@ -96,9 +96,9 @@ def test_a_bound_is_about_the_set_point(settings: tuple[str, ...]) -> None:
 def test_the_files_of_a_margin_say_what_is_proven_of_some_locations() -> None:
     """One document has all losses; a statement about fewer is of the runs that visit only some locations."""
     result = find_margin(drive("certificate.late_periods=0"), with_period=False)
-    assert result.stable_m == 12
+    assert result.stable_mansd == 11
     assert result.destabilised is not None
-    assert result.destabilised.m == 14
+    assert result.destabilised.mansd == 13
     proof = result.proof
     assert proof is not None
     found = prove(proof.document, proof.proof)

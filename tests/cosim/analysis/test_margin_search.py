@@ -59,33 +59,37 @@ def test_longest_period_is_that_of_the_sampled_loop() -> None:
 def test_verdicts_agree_with_the_bounds() -> None:
     trigger = {"policy": "periodic", "period_s": 0.5}
     margin = find_margin(resolve(held_integrator(trigger=trigger)), with_period=False)
-    assert [cap.m for cap in margin.caps] == list(range(1, len(margin.caps) + 1))
+    assert [cap.mansd for cap in margin.caps] == list(range(len(margin.caps)))
     assert [cap.stability.verdict for cap in margin.caps[:-1]] == ["stable"] * (len(margin.caps) - 1)
     assert all(cap.stability.upper < 1 for cap in margin.caps[:-1])
     growth = [cap.stability.lower for cap in margin.caps]
     assert growth == sorted(growth)
     assert margin.destabilised is not None
     assert margin.destabilised.stability.lower > 1
-    assert f"M ≤ {margin.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(margin)
+    text = f"at most {margin.stable_mansd} lost in a row; with {len(growth) - 1} lost in a row this pattern"
+    assert f"{text} destabilises: D" in str(margin)
 
 
-def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:
+def test_constraints_that_limit_the_losses_alone_make_every_mansd_stable() -> None:
     constraints = [{"kind": "at_most", "losses": 1, "window": 4}]
     settings = {"network.constraints": constraints, "network.mansd": 5}
     margin = noack.margin(held_integrator(**settings), period=False)
-    assert margin.every_m
-    assert margin.stable_m == 2
-    assert "every M ≥ 2" in margin.verdict
+    assert margin.every_mansd
+    assert margin.stable_mansd == 1
+    assert "with any mansd ≥ 1" in margin.verdict
     assert margin.to_json()["period"] is None
     assert margin.unverified_text == ""
     unverified = replace(margin, proof=None)
-    text = "that M = 2 is stable: computed by noack with error bounds, not verified by noack-check"
+    text = (
+        "that the loop is stable with at most 1 lost in a row: computed by noack with error bounds, "
+        "not verified by noack-check"
+    )
     assert unverified.unverified_text == text
     assert text in repr(unverified)
     assert margin.verdict.startswith("proven stable for every loss pattern")
     assert unverified.verdict.startswith("stable for every loss pattern")
-    with pytest.raises(noack.NoackError, match="most 0: expected at least 1"):
-        noack.margin("lane_periodic", most_m=0)
+    with pytest.raises(noack.NoackError, match="most -1: expected at least 0"):
+        noack.margin("lane_periodic", most_mansd=-1)
 
 
 @pytest.mark.deep
@@ -99,15 +103,15 @@ def test_a_loop_with_events_has_a_margin_for_all_times_between_them() -> None:
     assert len(last["intervals_s"]) == len(last["pattern"].replace("L", "D").split("D")) - 1
     result = invoke("margin", "double_integrator", *DEADLINE, "--no-period")
     assert "with updates 0.2 to 0.8 s apart" in " ".join(result.output.split())
-    words = ["margin", "lane_periodic", "--no-period", "--most", "2"]
-    assert "proven stable for every loss pattern with M ≤ 2" in invoke(*words).output
+    words = ["margin", "lane_periodic", "--no-period", "--most", "1"]
+    assert "proven stable for every loss pattern with at most 1 lost in a row" in invoke(*words).output
 
 
 def test_the_played_settings_are_the_pattern() -> None:
     cap = noack.margin("lane_periodic", period=False).destabilised
     assert cap is not None
     played = load_scenario("lane_periodic", cap.settings)
-    assert played.network.mansd == cap.m - 1
+    assert played.network.mansd == cap.mansd
     run = noack.simulate(played)
     received = run.events()["received"].to_pylist()
     pattern = cap.stability.pattern
@@ -117,7 +121,7 @@ def test_the_played_settings_are_the_pattern() -> None:
 
 def test_stronger_and_weaker_guarantees_are_compared_with_the_scenarios() -> None:
     words = ["atmost 6 in 7", "mansd 4 recover 2"]
-    margin = noack.margin("lane_periodic", most_m=1, period=False, guarantees=words)
+    margin = noack.margin("lane_periodic", most_mansd=0, period=False, guarantees=words)
     own, weaker, stronger = margin.compared.guarantees
     assert (own.stability.verdict, stronger.stability.verdict) == ("stable", "stable")
     assert weaker.stability.verdict == "destabilised"
@@ -131,7 +135,7 @@ def test_stronger_and_weaker_guarantees_are_compared_with_the_scenarios() -> Non
     assert [compared["verdict"] for compared in margin.to_json()["compared"]] == [
         "stable", "destabilised", "stable"
     ]  # fmt: skip
-    options = ["--no-period", "--most", "1", "--guarantee", "atmost 6 in 7"]
+    options = ["--no-period", "--most", "0", "--guarantee", "atmost 6 in 7"]
     printed = " ".join(invoke("margin", "lane_periodic", *options).output.split())
     assert first in printed
 
@@ -150,17 +154,19 @@ def test_ctrl_c_leaves_what_was_decided(monkeypatch: pytest.MonkeyPatch, json_ou
 
     monkeypatch.setattr(LossMargin, "stability", interrupted)
     result = invoke("margin", "lane_periodic", *(["--json"] if json_output else []))
-    missing = ["M from 3 on", "the longest period", "random losses", "the certificate"]
+    missing = ["2 and more losses in a row", "the longest period", "random losses", "the certificate"]
     line = f"noack: stopped by the user (SIGINT); missing: {', '.join(missing)}"
     assert (result.exit_code, result.stderr.splitlines()[-1]) == (130, line)
     if json_output:
         document = json.loads(result.stdout)
-        assert [cap["m"] for cap in document["caps"]] == [1, 2]
-        assert document["stable_m"] == 2
+        assert [cap["mansd"] for cap in document["caps"]] == [0, 1]
+        assert document["stable_mansd"] == 1
         assert document["missing"] == missing
         assert document["period"] is None
     else:
-        assert "\nstable for every loss pattern with M ≤ 2" in result.stdout  # noack-check was not asked yet
+        assert (
+            "\nstable for every loss pattern with at most 1 lost in a row" in result.stdout
+        )  # noack-check was not asked yet
 
 
 def test_no_longest_time_between_updates_is_below_the_least_one(monkeypatch: pytest.MonkeyPatch) -> None:

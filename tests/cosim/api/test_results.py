@@ -54,8 +54,10 @@ def test_numbers_may_be_those_of_numpy(result: noack.CampaignResult) -> None:
     assert repetition.summary == result.summary
     assert repetition.draws(mode="hold", loss=np.float64(0.8)).num_rows == 30
     first, same = (
-        noack.margin("lane_periodic", most_m=m, accuracy=accuracy, period=False).caps[-1].stability.lower
-        for m, accuracy in ((np.int64(2), np.float64(1e-3)), (2, 1e-3))
+        noack.margin("lane_periodic", most_mansd=mansd, accuracy=accuracy, period=False)
+        .caps[-1]
+        .stability.lower
+        for mansd, accuracy in ((np.int64(1), np.float64(1e-3)), (1, 1e-3))
     )
     assert first == same
 

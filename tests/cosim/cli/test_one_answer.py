@@ -37,7 +37,7 @@ def test_the_answer_of_certify_is_that_of_margin(period_s: float, losses: int) -
     scenario = noack.load("lane_periodic", {"trigger.period_s": period_s, "network.mansd": losses})
     answer = noack.certify(scenario, search=False).answer
     assert answer.is_certified == (losses == 0)
-    margin = noack.margin(scenario, most_m=1, period=False)
+    margin = noack.margin(scenario, most_mansd=0, period=False)
     assert margin.certificate == answer
     assert str(margin).splitlines()[-1] == (
         f"noack certify --no-search, for at most M − 1 = {losses} consecutive losses: {answer.text}"
@@ -46,7 +46,7 @@ def test_the_answer_of_certify_is_that_of_margin(period_s: float, losses: int) -
 
 @pytest.mark.deep
 def test_a_played_pattern_is_long_enough_to_show_its_growth(tmp_path: Path) -> None:
-    margin = noack.margin("lane_periodic", most_m=7, period=False)
+    margin = noack.margin("lane_periodic", most_mansd=6, period=False)
     assert margin.destabilised is not None
     words = [word for setting in margin.destabilised.settings for word in ("--set", setting)]
     short = invoke("simulate", "lane_periodic", "--no-report", "--runs", tmp_path, *words)

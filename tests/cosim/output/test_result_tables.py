@@ -45,7 +45,7 @@ def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> No
         "settings": {"horizon_s": 1.0},
         "axes": [{"name": "loss", "key": "network.loss.probability", "values": [0.2, 0.8]}],
     }  # fmt: skip
-    margin = noack.margin("lane_periodic", most_m=2, period=False)
+    margin = noack.margin("lane_periodic", most_mansd=1, period=False)
     for result, name in (
         (margin, "margin"), (noack.campaign(grid, workers=1), "campaign"),
         (noack.certify("double_integrator", search=False), "certificates"),
@@ -53,7 +53,7 @@ def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> No
     ):  # fmt: skip
         files = noack.save_tables(result, tmp_path / name)
         assert files[0].name == f"{name}.csv"
-    result = invoke("margin", "lane_periodic", "--most", "2", "--no-period", "--tables", tmp_path)
+    result = invoke("margin", "lane_periodic", "--most", "1", "--no-period", "--tables", tmp_path)
     assert result.exit_code == 0, result.output
     own = tmp_path / "margin" / "margin.csv"
     assert own.read_bytes() == (tmp_path / "margin.csv").read_bytes()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.measurement.loss_bursts import histogram, loss_bursts, most_losses, outcomes, quantile_m
+from netem.measurement.loss_bursts import burst_quantile, histogram, loss_bursts, most_losses, outcomes
 from netem.traces.packet_trace import packet_trace
 
 flags = st.lists(st.booleans(), min_size=1, max_size=60)
@@ -47,17 +47,17 @@ def test_bursts_are_the_groups_of_consecutive_losses(effective: list[bool]) -> N
 
 
 @given(flags, st.sampled_from([0.1, 0.5, 0.75, 0.9, 1.0]))
-def test_m_of_a_share_is_the_smallest_that_covers_it(effective: list[bool], share: float) -> None:
+def test_the_losses_of_a_share_are_the_fewest_that_cover_it(effective: list[bool], share: float) -> None:
     bursts = loss_bursts(np.array(effective))
     counts, count = [], 0
     for ok in effective:
         count = 0 if ok else count + 1
         counts.append(count)
-    quantile = quantile_m(bursts, share)
+    quantile = burst_quantile(bursts, share)
     values_of = {quantile.packets: counts, quantile.bursts: bursts.length.tolist()}
-    for m, values in values_of.items():
-        for smaller, covered in ((m, True), (m - 1, False)):
-            within = sum(value <= smaller - 1 for value in values)
+    for most, values in values_of.items():
+        for smaller, covered in ((most, True), (most - 1, False)):
+            within = sum(value <= smaller for value in values)
             assert (smaller < 1) or (within >= share * len(values) - 1e-9) is (covered or not values)
 
 
@@ -85,13 +85,14 @@ def test_confidence_needs_as_many_bursts_as_wilks_says(share: float, fewest: int
     assert fewest == math.ceil(math.log(0.05) / math.log(share))
     for count in (fewest - 1, fewest):
         effective = np.tile([True, False], count)
-        confident = quantile_m(loss_bursts(effective), share).bursts_confident
+        confident = burst_quantile(loss_bursts(effective), share).bursts_confident
         assert (confident is None) == (count < fewest)
     rng = np.random.default_rng(1)
     covered = [
-        quantile_m(loss_bursts(_bursts(rng.geometric(0.3, 400))), share).bursts_confident for _ in range(400)
+        burst_quantile(loss_bursts(_bursts(rng.geometric(0.3, 400))), share).bursts_confident
+        for _ in range(400)
     ]
-    truth = 1 + math.ceil(math.log(1 - share) / math.log(0.7))
+    truth = math.ceil(math.log(1 - share) / math.log(0.7))
     assert np.mean([m is not None and m >= truth for m in covered]) >= 0.93
 
 

@@ -64,10 +64,10 @@ def test_its_margin_is_that_of_the_augmented_matrices() -> None:
         "model": {"A": A.tolist(), "B": B.tolist(), "gain": GAIN},
         "plant": {"initial_state": [0.5, 0.0, 0.0]},
     }
-    margins = [noack.margin(noack.load({**LOOP, **periodic, **more}), most_m=4, period=False).to_json()
+    margins = [noack.margin(noack.load({**LOOP, **periodic, **more}), most_mansd=3, period=False).to_json()
                for more in ({}, by_hand)]  # fmt: skip
     assert margins[0] == margins[1]
-    assert margins[0]["every_m"] or margins[0]["stable_m"]
+    assert margins[0]["every_mansd"] or margins[0]["stable_mansd"]
 
 
 def test_a_file_with_loops_has_it_in_each() -> None:

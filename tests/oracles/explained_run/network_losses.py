@@ -45,7 +45,7 @@ def _check_guarantee(run: ExplainedLoop, outcomes: PacketOutcome) -> None:
 def violations(scenario: Scenario, lost: np.ndarray) -> list[tuple[str, int]]:
     """Return the first packet whose loss violates each rule of a scenario's guarantee."""
     network, found = scenario.network, []
-    windows = [(network.mansd, network.mansd + 1, f"M − 1 = {network.mansd}")]
+    windows = [(network.mansd, network.mansd + 1, f"at most {network.mansd} lost in a row")]
     limits = [constraint for constraint in network.constraints if isinstance(constraint, AtMost)]
     windows += [(limit.losses, limit.window, limit.text()) for limit in limits]
     total = np.append(0, np.cumsum(lost))

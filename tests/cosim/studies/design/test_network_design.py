@@ -61,7 +61,7 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
     beyond = pole.best.beyond
     assert beyond is not None
     assert beyond.verdict == "destabilised"
-    more = pole.search.scenario_of(pole.best.K, pole.best.m + 1)
+    more = pole.search.scenario_of(pole.best.K, pole.best.mansd + 1)
     kept = pole.best.stability
     assert kept is not None
     assert final_size(more, kept.pattern) < 1e-3
@@ -72,7 +72,7 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
 @pytest.mark.parametrize(
     ("name", "settings", "design_request"),
     [
-        ("lane_periodic", (), DesignRequest(effort=0, most=7)),
+        ("lane_periodic", (), DesignRequest(effort=0, most=6)),
         ("unstable_pendulum", (), DesignRequest(effort=80, period_s=PERIOD_S)),
         ("unstable_pendulum", ("mode=zoh",), DesignRequest(effort=30, period_s=PERIOD_S)),
         ("unstable_pendulum", ZERO, DesignRequest(effort=60, period_s=PERIOD_S)),
@@ -83,7 +83,7 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
 ) -> None:
     outcome = searched(shipped(name, *settings), design_request)
     given, best = outcome.given, outcome.best
-    assert best.m > given.m
+    assert best.mansd > given.mansd
     assert best.cost <= outcome.search.cost_limit
     assert best.stability is not None
     assert LossMargin(resolve(outcome.shown.scenario)).coarse_bounds().upper < 1
@@ -103,9 +103,9 @@ def test_the_written_scenario_is_checked_and_decided_as_claimed(tmp_path: Path, 
     assert "<svg" in page.read_text()
     assert invoke("check", out).exit_code == 0
     decided = json.loads(
-        invoke("margin", out, "--no-period", "--most", 4, "--accuracy", 0.02, "--json").stdout
+        invoke("margin", out, "--no-period", "--most", 3, "--accuracy", 0.02, "--json").stdout
     )
-    assert decided["stable_m"] == outcome["best"]["certified"] == 3
+    assert decided["stable_mansd"] == outcome["best"]["certified"] == 2
     assert decided["mansd"] == 2
     pasted = tmp_path / "pasted.toml"
     pasted.write_text(outcome["lines"])
