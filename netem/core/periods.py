@@ -19,7 +19,7 @@ _ROUNDING = 1e-15
 
 
 def simplest_fraction(number: float) -> Fraction:
-    """Return the fraction that is meant by a positive number: 1/30 by 0.03333333333333333."""
+    """Return the fraction that is meant by a number of at least 0: 1/30 by 0.03333333333333333."""
     exact, limit = Fraction(number), 1
     while abs((meant := exact.limit_denominator(limit)) - exact) > _ROUNDING * exact:
         limit *= 10
@@ -27,8 +27,13 @@ def simplest_fraction(number: float) -> Fraction:
 
 
 def exact_ns(seconds: float) -> Fraction:
-    """Return the nanoseconds that are meant by a positive number of seconds."""
+    """Return the nanoseconds that are meant by a number of seconds of at least 0."""
     return simplest_fraction(seconds) * NS_PER_S
+
+
+def whole_ns(seconds: float) -> int:
+    """Return the nanoseconds that are meant by a time of at least 0 s, rounded down."""
+    return int(exact_ns(seconds))
 
 
 def nearest_ns(time_ns: Fraction) -> int:

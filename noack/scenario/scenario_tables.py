@@ -13,9 +13,10 @@ from pydantic import Field, FiniteFloat
 from netem.core.clock import NEVER_NS, NS_PER_S
 from netem.core.errors import CallerError
 from netem.core.number_format import as_html, as_text
-from netem.core.periods import Period, exact_ns, period_of, simplest_fraction
+from netem.core.periods import Period, exact_ns, period_of, whole_ns
 from netem.core.settings_section import FolderName, ScenarioSection
 from noack.controllers.linear_feedback import LinearFeedbackSettings
+from noack.core.schedule import Schedule, first_tick_ns
 from noack.plants.linear import LinearSettings
 from noack.protocol.roles import PROTOCOLS, LoopProtocol
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
@@ -237,7 +238,7 @@ class Timing:
     @property
     def has_whole_periods(self) -> bool:
         """Whether all periods are whole numbers of nanoseconds: if not, steps differ by 1 ns."""
-        return self.plant_period.is_whole and self.controller_period.is_whole
+        return self.schedule().is_whole
 
     @property
     def plant_period_ns(self) -> int:
@@ -254,6 +255,22 @@ class Timing:
         """Longest time between two ticks of the controller."""
         return self.controller_period.longest_ns
 
+    def schedule(
+        self, late_periods: int = 0, network_delay_s: float = 0.0, input_gap_ns: int = 0
+    ) -> Schedule:
+        """Return steps, measurements and ticks with what lateness, delays and lost inputs may add."""
+        plant, controller = self.scenario.plant, self.scenario.controller
+        return Schedule(
+            self.plant_period,
+            plant.measure_every,
+            self.controller_period,
+            controller.phase,
+            late_periods,
+            network_delay_s,
+            input_gap_ns,
+            controller.predictions,
+        )
+
     @property
     def last_step(self) -> int:
         """The number of the plant's last step."""
@@ -261,18 +278,13 @@ class Timing:
 
     @property
     def controller_phase_ns(self) -> int:
-        """Time of the controller's first tick; rounded up, so that it is not before a step at its time."""
-        phase, period = self.scenario.controller.phase, self.controller_period
-        if period.is_whole:
-            return round(phase * period.longest_ns)
-        return math.ceil(simplest_fraction(phase) * period.exact)
+        """Time of the controller's first tick."""
+        return first_tick_ns(self.scenario.controller.phase, self.controller_period)
 
     @property
     def exact_controller_phase(self) -> Fraction:
         """The same time without rounding, if machines round periods."""
-        if self.has_whole_periods:
-            return Fraction(self.controller_phase_ns)
-        return simplest_fraction(self.scenario.controller.phase) * self.controller_period.exact
+        return self.schedule().exact_phase
 
     def exact_time(self, seconds: float, used_ns: int) -> Fraction:
         """Return a time for which machines use ``used_ns``: without rounding, if they round periods."""
@@ -297,7 +309,7 @@ class Timing:
     def update_timeout_ns(self) -> int:
         """Age of the newest update from which on the controller does not use it."""
         timeout_s = self.scenario.controller.update_timeout_s
-        return NEVER_NS if timeout_s is None else int(exact_ns(timeout_s))
+        return NEVER_NS if timeout_s is None else whole_ns(timeout_s)
 
     @property
     def actuation_gap_ns(self) -> int | None:
@@ -312,7 +324,7 @@ class Timing:
     @property
     def predicted_ns(self) -> int:
         """Time for which an actuation has inputs."""
-        return math.floor(self.scenario.controller.predictions * self.controller_period.exact)
+        return self.schedule().predicted_ns
 
     @property
     def missing_actuation_ns(self) -> int:
@@ -329,7 +341,7 @@ class Timing:
         """The time that the sensor waits for an acknowledgement before it transmits again."""
         network = self.scenario.network
         if network.reverse.timeout_s is not None:
-            return int(exact_ns(network.reverse.timeout_s))
+            return whole_ns(network.reverse.timeout_s)
         round_trip_s = network.link.longest_delay_s + network.reverse.link.longest_delay_s
         return int(_TIMEOUT_PERIODS * self.measurement_period.exact) + round(round_trip_s * NS_PER_S)
 

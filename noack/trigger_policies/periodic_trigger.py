@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
+from netem.core.periods import whole_ns
+from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings
 from noack.trigger_policies.trigger_rule import TriggerRule, no_form
 
 
@@ -17,7 +18,7 @@ class PeriodicSettings(WeightedSettings):
     """Period."""
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
-        period_ns = nanoseconds(self.period_s)
+        period_ns = whole_ns(self.period_s)
         return TriggerRule(no_form(len(model.A)), longest_ns=period_ns, weight=self.weight_matrix)
 
     def intervals(self) -> Mapping[str, tuple[str, float]]:

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, field_validator
 
 from netem.core.errors import CallerError
-from netem.core.periods import Period, exact_ns
+from netem.core.periods import Period, whole_ns
 from netem.core.settings_section import ReadTable, ScenarioSection
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.settings.values import MatrixRows, require_shape, rows_of
@@ -205,7 +205,7 @@ class CombinedSettings(PolicySettings):
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         rule = require_rule(self.rule.trigger_policy(model))
-        return self.combined(rule, nanoseconds(self.interval_s))
+        return self.combined(rule, whole_ns(self.interval_s))
 
     def resolved(self, model: ModelMatrices) -> Self:
         return self.model_copy(update={"rule": self.rule.resolved(model)})
@@ -226,8 +226,3 @@ class CombinedSettings(PolicySettings):
 
     def check_period(self, measured: Period, key: str = "trigger") -> None:
         self.rule.check_period(measured, f"{key}.rule")
-
-
-def nanoseconds(seconds: float) -> int:
-    """Return a time in whole nanoseconds, rounded down: whole steps then take as many."""
-    return int(exact_ns(seconds))

@@ -11,10 +11,10 @@ import numpy as np
 from pydantic import Field
 
 from netem.core.clock import NS_PER_S
-from netem.core.periods import Period, exact_ns
+from netem.core.periods import Period, exact_ns, whole_ns
 from netem.core.settings_section import NonNegative
 from noack.settings.values import MatrixRows, require_shape
-from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
+from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings
 from noack.trigger_policies.trigger_rule import TriggerRule, quadratic_form
 
 
@@ -38,7 +38,7 @@ class QuadraticSettings(WeightedSettings):
         return cls(policy="quadratic", Q=Q, epsilon=0.0025, period_s=0.05)
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
-        period_ns = nanoseconds(self.period_s)
+        period_ns = whole_ns(self.period_s)
         return TriggerRule(
             quadratic_form(np.array(self.Q)),
             floor=float(np.sqrt(self.epsilon)),

@@ -15,9 +15,10 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import model_validator
 
+from netem.core.periods import whole_ns
 from netem.core.settings_section import NonNegative, Positive
 from noack.trigger_policies.decaying import decaying_text
-from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
+from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings
 from noack.trigger_policies.trigger_rule import Forecast, TriggerRule, no_form
 
 
@@ -78,8 +79,8 @@ class SelfTriggeredSettings(WeightedSettings):
         )
         return TriggerRule(
             no_form(len(model.A)),
-            shortest_ns=nanoseconds(self.shortest_s),
-            longest_ns=nanoseconds(self.longest_s),
+            shortest_ns=whole_ns(self.shortest_s),
+            longest_ns=whole_ns(self.longest_s),
             forecast=forecast,
             weight=self.weight_matrix,
         )

@@ -4,7 +4,6 @@ import copy
 import functools
 import math
 from collections.abc import Callable
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,11 @@ import pytest
 from flint import arb, fmpq
 from scipy.linalg import expm
 
+from netem.core.periods import period_of
 from noack.core.balls import beside, identity, matrix, number, zeros
+from noack.core.schedule import Schedule
 from noack.proof.elaborate.errors import RejectedError
 from noack.proof.elaborate.loop import Loop, Memory
-from noack.proof.elaborate.times import ScenarioSchedule
 from noack.proof.search.results import Proof, smallest_bounds
 from noack.proof.statement_proof import prove_statement
 from noack.theory.witnesses.documents import witness_by_gains
@@ -341,7 +341,8 @@ STEADY = scalar(0, SCHEDULE, floor=0.02)._replace(pushes=identity(1), sizes=(num
 QUIET = scalar(0, SCHEDULE._replace(start=fmpq(0)), level=1e-3)
 """What moves e_s beside the errors themselves shows at once."""
 NETWORK_S = fmpq(1, 50)
-UNTIL_IT_ACTS = ScenarioSchedule(100.0, 1, 10.0, 0.0, 0, 0.02, input_delay_ns=Fraction(10**7)).times.delay
+_OF_INPUTS = Schedule(period_of(100.0), 1, period_of(10.0), 0.0, network_delay_s=0.02, input_gap_ns=10**7)
+UNTIL_IT_ACTS = fmpq(_OF_INPUTS.bounds.delay_ns, 10**9)
 """20 ms in the network, up to 100 ms until a tick, 10 ms on the way of its input: 130 ms."""
 LIES: dict[str, tuple[Loop, Callable[[Loop], Loop]]] = {
     "a loss": (scalar(times=SCHEDULE, floor=0.02), lambda loop: loop._replace(losses=0)),

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
-from netem.core.periods import period_of
 from noack.core.balls import matrix, number
 from noack.proof.elaborate.errors import RejectedError
 from noack.proof.elaborate.hybrid_system import Edge, Model
 from noack.proof.elaborate.loop import Loop, Times
-from noack.proof.elaborate.times import ScenarioSchedule
 from noack.proof.statement_proof import prove_statement
 from tests.checker.changes import DOCUMENTS, accepted
 from tests.checker.changes import LOOPS as OTHER_LOOPS
@@ -173,27 +171,6 @@ def test_a_later_event_shortens_the_time_that_an_update_has_left() -> None:
     assert ends["0 later"] == ends["start, 0 later"] == ends["0 lost"] == pytest.approx(0.02)
     assert ends["1 later"] == ends["start, 1 later"] == pytest.approx(0.005)
     assert all(begin >= 0.015 for begin, _ in times_of(model, "0 later, event")[0])
-
-
-@pytest.mark.parametrize(
-    ("rate_hz", "measure_every", "period_s"),
-    [(500.0, 1, 0.5), (30.0, 1, 0.1), (30.0, 1, 0.11), (59.94, 2, 0.25), (7.0, 1, 0.01), (120.0, 7, 1.0)],
-)
-def test_the_times_between_events_are_those_of_measurements(
-    rate_hz: float, measure_every: int, period_s: float
-) -> None:
-    schedule = ScenarioSchedule(rate_hz, measure_every, 100.0, 0.0, 0, 0.0)
-    due_ns = round(period_s * 10**9)
-    least, most = schedule.between_events(due_ns)
-    period = period_of(rate_hz).times(measure_every)
-    found, event = set(), 0
-    for step in range(1, 20_000):
-        t_ns = period.time_ns(step)
-        if t_ns - event >= due_ns:
-            found.add(t_ns - event)
-            event = t_ns
-    assert all(least <= fmpq(ns, 10**9) <= most for ns in found)
-    assert float(most.p) / float(most.q) - period_s <= measure_every / rate_hz + 2e-9
 
 
 # Wrong loops.

@@ -1,7 +1,6 @@
 """The checker reads a resolved scenario as noack does."""
 
 import copy
-import random
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from noack.proof.elaborate.loop import Loop
 from noack.proof.elaborate.scenario import output_names, read_loop
 from noack.scenario.resolution import loop_of, resolve, rule_of
 from noack.scenario.scenario import Scenario
-from noack.scenario.sections import ActuationSection
 from noack.theory.certificates.conditions import about_reference, allowed_conditions, ideal_conditions
 from tests.helpers.resolved_tables import first_loop, resolved_tables, tables_of
 from tests.helpers.shipped import resolved, shipped
@@ -134,43 +132,6 @@ def test_shipped_scenarios_are_read_as_noack_reads_them(name: str) -> None:
     for half, given in ((box.half_A, plant.uncertainty_A), (box.half_B, plant.uncertainty_B)):
         assert floats(half).any() == (given is not None and np.any(given))
         assert given is None or (floats(half) == np.array(given)).all()
-
-
-RATES = (500.0, 1000.0, 100.0, 50.0, 40.0, 25.0, 30.0, 60.0, 90.0, 120.0, 144.0, 59.94, 333.0, 7.0, 0.3)
-
-
-def test_times_are_those_of_noack() -> None:
-    """100 draws, of which most have a period that is no whole number of nanoseconds; some lose inputs."""
-    draw, base = random.Random(5), first_loop("double_integrator")
-    uneven = 0
-    for number in range(100):
-        plant = {"rate_hz": draw.choice(RATES), "measure_every": draw.choice((1, 1, 2, 5, 7))}
-        controller = {
-            "rate_hz": draw.choice((plant["rate_hz"], draw.choice(RATES))),
-            "phase": draw.choice((0.0, 0.5, 0.25, 1 / 3, 0.999, draw.random())),
-        }
-        certificate = {
-            "late_periods": draw.choice((0, 0, 1, 2, 9)),
-            "network_delay_s": draw.choice((None, 0.0, 0.001, 0.02, 1 / 30, draw.uniform(0, 0.3))),
-        }
-        inputs = None
-        if draw.random() < 0.5:
-            delay_s = draw.choice((0.0, 0.0, 0.001, 0.02, draw.uniform(0, 0.1)))
-            impairments = ({"kind": "delay", "delay_s": delay_s},) if delay_s else ()
-            inputs = ActuationSection.model_validate({"mansd": draw.randrange(4), "impairments": impairments})
-            controller["predictions"] = draw.randrange(1, 6)
-        resolved = base.model_copy(
-            update={
-                "network": base.network.model_copy(update={"actuation": inputs}),
-                "plant": base.plant.model_copy(update=plant),
-                "controller": base.controller.model_copy(update=controller),
-                "certificate": base.certificate.model_copy(update=certificate),
-            }
-        )
-        uneven += not resolved.timing.has_whole_periods
-        found = times_ns(read_loop(tables_of(resolved), box=False, ideal=False))
-        assert found == conditions_ns(resolved), (number, plant, controller, certificate)
-    assert 25 < uneven < 95
 
 
 Q = "[[-0.04, 0.01, 0, 0], [0.01, -0.02, 0, 0.3], [0, 0, 1, -0.2], [0, 0.3, -0.2, 2]]"

@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 from netem.core.clock import NS_PER_S
 from netem.core.core_library import core, ffi
 from netem.core.named_file import NamedFile
-from netem.core.periods import exact_ns
+from netem.core.periods import whole_ns
 from netem.core.settings_section import Correlation, Table
 from netem.impairments.clauses import Clause, Part, Word, flag
 from netem.impairments.feature import (
@@ -229,7 +229,7 @@ class Delay(FileFeature, Impairment):
     @property
     def constant_ns(self) -> int:
         """delay_s in whole nanoseconds, rounded down (:mod:`netem.core.periods`)."""
-        return int(exact_ns(self.delay_s)) if self.delay_s else 0
+        return whole_ns(self.delay_s)
 
     def stage(self, tables: StageTables) -> Stage:
         self.require_content()

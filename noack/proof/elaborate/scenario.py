@@ -12,6 +12,8 @@ from typing import NamedTuple, Required, TypedDict
 
 from flint import arb, arb_mat, fmpq
 
+from netem.core.clock import NS_PER_S
+from netem.core.periods import exact_ns, period_of, whole_ns
 from noack.core.balls import (
     beside,
     columns_of,
@@ -24,13 +26,13 @@ from noack.core.balls import (
     transpose,
     zeros,
 )
+from noack.core.schedule import Schedule
 from noack.proof.elaborate.errors import RefusedError, RejectedError
 from noack.proof.elaborate.keys import Table, refusals
 from noack.proof.elaborate.loop import Along, Loop, LoopObserver, Memory, Region, Rule, Times
 from noack.proof.elaborate.norms import lyapunov_function, spectral_norm
 from noack.proof.elaborate.reference import EnclosedSegment, Matrices, Moments, about_reference, padded
 from noack.proof.elaborate.tables import read_table
-from noack.proof.elaborate.times import NS_PER_S, ScenarioSchedule, fraction, nanoseconds, nearest_ns
 from noack_equations import LinearPlants, region_of
 from noack_equations import RejectedError as RejectedEquationsError
 
@@ -190,7 +192,7 @@ def _segments(controller: Table, n: int, m: int) -> list[EnclosedSegment]:
             ]
             if any(len(each) != len(hz) for each in waves[wave]):
                 raise RefusedError(f"controller.reference: not {wave} for each frequency")
-        begin = fmpq(nearest_ns(_real(entry, "controller.reference.from_s")), NS_PER_S)
+        begin = _seconds(round(_real(entry, "controller.reference.from_s") * NS_PER_S))
         if begin <= found[-1].begin if found else begin != 0:
             raise RefusedError(
                 "controller.reference.from_s: the first segment begins at 0, each other one later"
@@ -386,13 +388,13 @@ def _window(constraint: Table) -> tuple[int, int]:
 def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
     """Return the times; a rule with a grid is tested at its points, and otherwise at measurements."""
     plant, zero, due = _table(resolved, "plant"), fmpq(0), _due_ns(trigger)
-    times = Times(zero, zero, zero, zero, zero, *(fmpq(ns, NS_PER_S) for ns in due))
+    times = Times(zero, zero, zero, zero, zero, *map(_seconds, due))
     if not ideal:
         schedule = read_schedule(resolved)
-        times = schedule.times
+        times = Times(*map(_seconds, schedule.bounds))
         if due[1]:
-            (first, _), (_, last) = (schedule.between_events(ns) for ns in due)
-            times = times._replace(least_period=first, period=last)
+            (first, _), (_, last) = map(schedule.between_events_ns, due)
+            times = times._replace(least_period=_seconds(first), period=_seconds(last))
         _require_watchdog(_optional_table(plant, "watchdog"), schedule)
         _require_stated_delay(resolved)
     if due[1]:
@@ -400,9 +402,9 @@ def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
     outer, inner = _combined(trigger)[:-1], _combined(trigger)[-1]
     if inner.get("policy") == "quadratic":
         grid_ns = _interval_ns(inner, "trigger.period_s")
-        if Fraction(grid_ns) % read_schedule(resolved).sample:
+        if grid_ns % read_schedule(resolved).sample.exact:
             raise RefusedError("trigger.period_s: not a multiple of the time between measurements")
-        grid = fmpq(grid_ns, NS_PER_S)
+        grid = _seconds(grid_ns)
         # With a deadline an event may come between two points of the grid.
         has_deadline = any(rule.get("policy") == "deadline" for rule in outer)
         least = times.least_sampling if has_deadline else grid
@@ -416,14 +418,14 @@ def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
     if intervals.dwell:
         if not is_exact:
             raise RefusedError("trigger.interval_s: not covered with tests that are not an exact time apart")
-        dwell = fmpq(intervals.dwell, NS_PER_S)
+        dwell = _seconds(intervals.dwell)
         times = times._replace(dwell=(dwell / sampling).ceil() * sampling if sampling > 0 else dwell)
     if intervals.longest and not (outer and inner.get("heartbeat")):
-        first_due, longest = fmpq(intervals.shortest, NS_PER_S), fmpq(intervals.longest, NS_PER_S)
+        first_due, longest = map(_seconds, intervals[1:])
         if not ideal:
             schedule = read_schedule(resolved)
-            first_due = schedule.between_events(intervals.shortest)[0]
-            longest = schedule.between_events(intervals.longest)[1]
+            first_due = _seconds(schedule.between_events_ns(intervals.shortest)[0])
+            longest = _seconds(schedule.between_events_ns(intervals.longest)[1])
         elif outer:
             longest += sampling
         times = times._replace(due=first_due, longest=longest)
@@ -473,7 +475,7 @@ def _intervals(trigger: Table) -> _Intervals:
 
 
 def _interval_ns(trigger: Table, name: str) -> int:
-    interval_ns = nanoseconds(_real(trigger, name))
+    interval_ns = whole_ns(_real(trigger, name))
     if not interval_ns:
         raise RefusedError(f"{name}: below 1 ns")
     return interval_ns
@@ -494,25 +496,36 @@ def _due_ns(trigger: Table) -> tuple[int, int]:
     return (times.longest, times.longest) if is_due_first else (0, 0)
 
 
-def read_schedule(resolved: Table) -> ScenarioSchedule:
+def read_schedule(resolved: Table) -> Schedule:
     """Return the schedule of a resolved scenario."""
     plant, controller, certificate = (_table(resolved, key) for key in ("plant", "controller", "certificate"))
     name = "controller.predictions"
-    inputs = (0, Fraction(0), _whole(controller, name) if "predictions" in controller else 1)
-    if inputs[2] < 1:
+    predictions = _whole(controller, name) if "predictions" in controller else 1
+    if predictions < 1:
         raise RefusedError(f"{name}: below 1")
+    step, tick = (
+        period_of(_rate(table, f"{name}.rate_hz"))
+        for table, name in ((plant, "plant"), (controller, "controller"))
+    )
+    gap_ns = 0
     if "actuation" in (network := _table(resolved, "network")):
         direction, name = _table(network, "actuation"), "network.actuation"
-        inputs = (most_losses(direction, name), _constant_delay_ns(direction, name), inputs[2])
-    return ScenarioSchedule(
-        _rate(plant, "plant.rate_hz"),
+        delay_ns = math.ceil(_constant_delay_ns(direction, name))
+        gap_ns = most_losses(direction, name) * tick.longest_ns + delay_ns
+    return Schedule(
+        step,
         max(_whole(plant, "plant.measure_every"), 1),
-        _rate(controller, "controller.rate_hz"),
+        tick,
         _real(controller, "controller.phase"),
         _whole(certificate, "certificate.late_periods"),
         _real(certificate, "certificate.network_delay_s") if "network_delay_s" in certificate else 0.0,
-        *inputs,
+        gap_ns,
+        predictions,
     )
+
+
+def _seconds(time_ns: int) -> fmpq:
+    return fmpq(time_ns, NS_PER_S)
 
 
 def _require_stated_delay(resolved: Table) -> None:
@@ -543,8 +556,7 @@ def _constant_delay_ns(direction: Table, name: str) -> Fraction:
     for entry in _tables(direction, f"{name}.impairments"):
         kind = entry.get("kind")
         if kind == "delay" and not (entry.get("jitter_s") or entry.get("samples_s") or entry.get("file")):
-            delay_s = _real(entry, f"{name}.impairments.delay_s")
-            total += fraction(delay_s) * NS_PER_S if delay_s else 0
+            total += exact_ns(_real(entry, f"{name}.impairments.delay_s"))
         elif kind not in _WITHOUT_DELAY:
             raise RefusedError(f"{name}.impairments: {kind}: the delay is not constant")
     return total
@@ -583,7 +595,7 @@ def update_timeout(resolved: Table) -> UpdateTimeout:
     holds = controller.get("timeout_input") == "hold"
     if "update_timeout_s" not in controller:
         return UpdateTimeout(None, holds)
-    after_ns = fraction(_real(controller, "controller.update_timeout_s")) * NS_PER_S
+    after_ns = exact_ns(_real(controller, "controller.update_timeout_s"))
     if not after_ns > 0:
         raise RefusedError("controller.update_timeout_s: not above 0")
     return UpdateTimeout(Fraction(int(after_ns)) if read_schedule(resolved).is_whole else after_ns, holds)
@@ -627,20 +639,20 @@ def read_linear_loop(resolved: Table) -> Loop:
     return loop
 
 
-def _require_watchdog(watchdog: Table, schedule: ScenarioSchedule) -> None:
+def _require_watchdog(watchdog: Table, schedule: Schedule) -> None:
     """Require that the plant's watchdog does not replace inputs as old as they may be.
 
     With the policy "hold" it applies the last one of the newest tick, which may have to wait for its time.
     """
     holds = watchdog.get("policy", "hold") == "hold"
-    if holds and not schedule.last_input > 0:
+    if holds and not schedule.last_prediction_ns:
         return
     timeout_s = _real(watchdog, "plant.watchdog.timeout_s")
-    oldest = schedule.last_input if holds else schedule.oldest_input
-    if fmpq(nanoseconds(timeout_s), NS_PER_S) < oldest:
+    oldest_ns = schedule.last_prediction_ns if holds else schedule.oldest_inputs_ns
+    if whole_ns(timeout_s) < oldest_ns:
         raise RefusedError(
             f"plant.watchdog.timeout_s = {timeout_s:g}: the watchdog may replace an input, "
-            f"which may be {float(oldest.p) / float(oldest.q):g} s old"
+            f"which may be {oldest_ns / NS_PER_S:g} s old"
         )
 
 
@@ -807,7 +819,7 @@ def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> LoopObserver 
     gains = tuple(matrix(rows) for rows in _gains(observer))
     if any((gain.nrows(), gain.ncols()) != (n, C.nrows()) for gain in gains):
         raise RefusedError("observer: a gain has not a row for each state, and a column for each output")
-    return LoopObserver(gains, C, start, fmpq(int(schedule.sample), NS_PER_S))
+    return LoopObserver(gains, C, start, _seconds(schedule.sample.longest_ns))
 
 
 def _gains(observer: Table) -> list[Rows]:

@@ -37,6 +37,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
+from netem.core.clock import NS_PER_S
 from noack.core.balls import identity, is_positive, rows_of, stack, transpose, zeros
 from noack.proof.elaborate.errors import RefusedError, RejectedError
 from noack.proof.elaborate.keys import Table
@@ -49,7 +50,6 @@ from noack.proof.elaborate.scenario import (
     update_timeout,
 )
 from noack.proof.elaborate.tables import read_count, read_matrix, read_number, read_rows, read_table
-from noack.proof.elaborate.times import NS_PER_S
 
 _MOST_STEPS, _MOST_SLOTS, _MOST_SIZE, _MOST_UNITS = 20_000, 64, 80, 100_000
 MOST_BURSTS = 5000
@@ -431,19 +431,20 @@ def read_periodic_loop(resolved: Table, longest: int | None = None) -> PeriodicL
         RefusedError: a key is not covered, is missing or has a wrong value.
     """
     loop, schedule = read_linear_loop(resolved), read_schedule(resolved)
-    least, most = (max(ceil(Fraction(ns) / schedule.sample), 1) for ns in times_between_events(resolved))
+    step, tick, sample = (period.exact for period in (schedule.step, schedule.tick, schedule.sample))
+    least, most = (max(ceil(ns / sample), 1) for ns in times_between_events(resolved))
     if longest is not None:
         least, most = longest if least == most else min(least, longest), longest
     measurements = most if least == most else 1
-    unit, delay = schedule.sample * measurements, constant_delay_ns(resolved)
+    unit, delay = sample * measurements, constant_delay_ns(resolved)
     timeout, behind = update_timeout(resolved), int(delay // unit)
     rest = delay - behind * unit
-    exact = (schedule.step, schedule.tick, schedule.exact_phase, unit, rest, timeout.after_ns or Fraction(0))
+    exact = (step, tick, schedule.exact_phase, unit, rest, timeout.after_ns or Fraction(0))
     parts = lcm(*(t.denominator for t in exact))
-    step, tick, first_tick, whole_unit, rest_of_delay, after = (int(t * parts) for t in exact)
+    whole_step, whole_tick, first_tick, whole_unit, rest_of_delay, after = (int(t * parts) for t in exact)
     times = TransmissionTimes(
-        step=step,
-        tick=tick,
+        step=whole_step,
+        tick=whole_tick,
         phase=first_tick,
         unit=whole_unit,
         rest=rest_of_delay,
@@ -452,7 +453,7 @@ def read_periodic_loop(resolved: Table, longest: int | None = None) -> PeriodicL
         holds_input=timeout.holds_input,
         parts=parts,
     )
-    if times.slots > _MOST_SLOTS or lcm(step, tick) // min(step, tick) > _MOST_STEPS:
+    if times.slots > _MOST_SLOTS or lcm(*times[:2]) // min(times[:2]) > _MOST_STEPS:
         raise RefusedError("the times of the loop repeat only after too many steps")
     if most > _MOST_UNITS:
         raise RefusedError("trigger: too many measurements between two events")

@@ -4,14 +4,11 @@ At a set-point x_r the loop is described in the coordinates x − x_r, x_s − x
 models rest at x_r with u_r: Âx_r + B̂u_r = 0.
 """
 
-import math
-from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
 
 from netem.core.clock import NS_PER_S
-from netem.core.periods import exact_ns
 from netem.core.settings_section import Table
 from netem.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from netem.impairments.markov_chain import NotPredictableError
@@ -19,6 +16,7 @@ from netem.impairments.target_loss import loss_process
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix
 from noack.core.references import Reference
+from noack.core.schedule import Schedule
 from noack.references.segment import SolutionSegment
 from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import loop_of, setpoint_of
@@ -31,8 +29,6 @@ OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
 EQUATIONS = "the scenario's plant, by its equations"
 """The plants that a certificate covers, by name."""
-_ROUNDED_NS = 2
-"""More than two times of steps differ from exact ones, together."""
 _ROUNDED_JUMP = 1e-9
 """A difference between two pieces of a reference is rounding up to this share of the largest x_r or u_r."""
 
@@ -75,68 +71,30 @@ class NetworkConditions(NamedTuple):
 def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkConditions:
     """Return the conditions of a scenario's schedule, with lateness up to ``late_periods`` steps.
 
-    The conditions are in the plant's time and hold for all rates. An update takes effect at the
-    first step with an actuation from a tick at or after the update. The model state of an applied
-    input ages until the step after it. At equal times, the plant's step comes before arrivals. If
-    the network delay has no bound, four times its jitter is used; a run with a longer delay
-    violates the conditions. Lost and delayed actuations delay updates and make inputs older; if
-    their losses have no bound, an input may be as old as the run. Of predicted inputs, the plant
-    applies the one whose time has come.
+    The conditions are in the plant's time and hold for all rates: see :class:`noack.core.schedule.Schedule`.
+    If the network delay has no bound, four times its jitter is used; a run with a longer delay violates the
+    conditions. If losses of inputs have no bound, an input may be as old as the run.
     """
-    timing = resolved.timing
-    step_ns, tick_ns = timing.plant_period.exact, timing.controller_period.exact
-    phase_ns, sample_ns = timing.controller_phase_ns, timing.measurement_period.exact
-    rounded_ns = _rounded_ns(resolved)
-    # Age of the newest tick at a step: 0 < age ≤ tick and age ≡ −phase modulo the gcd; all these
-    # values occur. Time from a measurement to the next tick: 0 ≤ wait < tick.
-    newest_ns = tick_ns - phase_ns % _gcd(step_ns, tick_ns) + rounded_ns
-    common_ns = _gcd(sample_ns, tick_ns)
-    wait_ns = tick_ns - common_ns + phase_ns % common_ns
-    late_ns = late_periods * timing.plant_period_ns
-    in_flight_ns = network_delay_ns(resolved, late_periods)
-    if in_flight_ns > 0:  # an update in flight for up to this time may just miss a tick
-        wait_ns = in_flight_ns + tick_ns - 1
-        if rounded_ns:  # of the possible times, the largest one below
-            rest_ns = phase_ns % common_ns
-            wait_ns = (math.ceil((wait_ns + 1 - rest_ns) / common_ns) - 1) * common_ns + rest_ns
-    gap_ns = _actuation_gap_ns(resolved)
-    delay_ns, first_ns = (_next_step_ns(resolved, t_ns + gap_ns) for t_ns in (wait_ns, phase_ns))
-    # With a delay, the newest actuation that has arrived may just be one tick older than that.
-    oldest_ns = gap_ns + (newest_ns if gap_ns % tick_ns == 0 else tick_ns + rounded_ns)
-    predicted_ns = timing.predicted_ns - tick_ns
-    age_ns = math.ceil(max(min(oldest_ns, tick_ns + rounded_ns), oldest_ns - predicted_ns))
-    start_ns = first_ns if in_flight_ns == 0 else max(first_ns + late_ns, delay_ns)
+    bounds = schedule_of(resolved, late_periods).bounds
+    sampling_s, is_even = bounds.sampling_ns / NS_PER_S, resolved.timing.has_whole_periods
     return ideal_conditions(resolved)._replace(
-        sampling_s=timing.measurement_period_ns / NS_PER_S,
-        spacing_s=0.0 if rounded_ns else timing.measurement_period_ns / NS_PER_S,
-        apart_s=timing.measurement_period.lengths_ns[0] / NS_PER_S if rounded_ns else 0.0,
-        delay_s=delay_ns / NS_PER_S,
-        hold_s=(age_ns + timing.plant_period_ns + late_ns) / NS_PER_S,
-        start_s=start_ns / NS_PER_S,
+        sampling_s=sampling_s,
+        spacing_s=sampling_s if is_even else 0.0,
+        apart_s=0.0 if is_even else bounds.least_sampling_ns / NS_PER_S,
+        delay_s=bounds.delay_ns / NS_PER_S,
+        hold_s=bounds.age_ns / NS_PER_S,
+        start_s=bounds.start_ns / NS_PER_S,
     )
 
 
-def _rounded_ns(resolved: Scenario) -> int:
-    """Return by how much times of steps, together, differ from exact ones; their order may, too."""
-    return 0 if resolved.timing.has_whole_periods else _ROUNDED_NS
+def schedule_of(resolved: Scenario, late_periods: int) -> Schedule:
+    """Return a scenario's schedule, with lateness up to some steps and the delays that are allowed for.
 
-
-def _next_step_ns(resolved: Scenario, t_ns: Fraction | int) -> int:
-    """Return a time up to which the plant's next step after a time has come."""
-    step_ns, rounded_ns = resolved.timing.plant_period.exact, _rounded_ns(resolved)
-    return math.ceil(((t_ns + rounded_ns) // step_ns + 1) * step_ns) + rounded_ns
-
-
-def _gcd(first: Fraction, second: Fraction) -> Fraction:
-    """Return the largest time of which both are multiples."""
-    unit = first.denominator * second.denominator
-    return Fraction(math.gcd(int(first * unit), int(second * unit)), unit)
-
-
-def _actuation_gap_ns(resolved: Scenario) -> int:
-    """Return the longest time by which the newest actuation is held up; without a bound, the run's length."""
-    gap_ns, horizon_ns = resolved.timing.actuation_gap_ns, resolved.timing.horizon_ns
-    return horizon_ns if gap_ns is None else gap_ns
+    If losses of inputs have no bound, they may be held up for the whole run.
+    """
+    timing = resolved.timing
+    gap_ns = timing.horizon_ns if timing.actuation_gap_ns is None else timing.actuation_gap_ns
+    return timing.schedule(late_periods, certified_delay_s(resolved), gap_ns)
 
 
 def certified_delay_s(resolved: Scenario) -> float:
@@ -191,10 +149,7 @@ def network_delay_text(resolved: Scenario) -> str:
 
 def network_delay_ns(resolved: Scenario, late_periods: int) -> int:
     """Return the longest time for which the network may delay an update under these conditions."""
-    timing, delay_s = resolved.timing, certified_delay_s(resolved)
-    if not timing.has_whole_periods:  # whole steps take as many: see netem.core.periods
-        return math.floor(late_periods * timing.plant_period.exact) + int(exact_ns(delay_s) if delay_s else 0)
-    return late_periods * timing.plant_period_ns + math.ceil(delay_s * NS_PER_S)
+    return schedule_of(resolved, late_periods).in_flight_ns
 
 
 def allowed_conditions(resolved: Scenario) -> NetworkConditions:
