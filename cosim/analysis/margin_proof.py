@@ -15,7 +15,7 @@ from noack.proof.forms_proof import FORMAT, as_text
 from noack.proof.period_document import PeriodDocument
 from noack.proof.period_graph import PeriodGraph, each_step
 from noack.scenario.outputs import LoopOutput
-from noack.theory.witnesses.loss_margin import LossMargin, Stability, capped
+from noack.theory.witnesses.loss_margin import LossMargin, Stability
 from noack.theory.witnesses.period_bounds import BoundSearch
 from noack.theory.witnesses.period_growth import GrowthSearch
 from noack.theory.witnesses.period_loops import Entry
@@ -90,8 +90,8 @@ class _Files:
 
     def __init__(self, margin: LossMargin, losses: int) -> None:
         self._margin, self._losses = margin, losses
-        self._rules = capped(margin.guarantee, losses).rules
-        self._document = PeriodDocument(margin.period_loop, self._rules)
+        self._guarantee = margin.guarantee.capped(losses)
+        self._document = PeriodDocument(margin.period_loop, self._guarantee)
 
     def _graph(self, losses: int) -> PeriodGraph:
         """Return the part of the document with at most so many losses."""
@@ -116,7 +116,7 @@ class _Files:
         best: tuple[float, list[Entry], PeriodDocument] | None = None
         for share in _SHARES:
             rate = float(f"{share * decay:.3g}")
-            self._document = PeriodDocument(self._margin.period_loop, self._rules, rate)
+            self._document = PeriodDocument(self._margin.period_loop, self._guarantee, rate)
             search, entries = BoundSearch(self._graph(losses)), list[Entry]()
             for output in asked:
                 entry = search.bound(output.name, _WEIGHT)

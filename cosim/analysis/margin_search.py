@@ -24,7 +24,7 @@ from netem.tc_words import guarantee_words, settings_of
 from noack.scenario.arrival_ties import late_inputs
 from noack.scenario.scenario import Scenario
 from noack.theory.random_losses.mean_square_growth import MeanSquareGrowth, growth_without_guarantee
-from noack.theory.witnesses.loss_margin import ACCURACY, LossMargin, Stability, capped, uncapped
+from noack.theory.witnesses.loss_margin import ACCURACY, LossMargin, Stability
 
 MOST_MANSD = 15
 """Largest number of losses in a row that is examined by default."""
@@ -383,7 +383,7 @@ def find_margin(
     most = whole_number("most", most_mansd, 0, _LARGEST_MANSD)
     _require_in_range(accuracy, effort)
     margin, network = LossMargin(resolved), resolved.network
-    other_rules = uncapped(network.guarantee)
+    other_rules = network.guarantee.uncapped
     words_of_others = [guarantees] if isinstance(guarantees, str) else guarantees
     others_read = [read_guarantee(words) for words in words_of_others]
 
@@ -403,7 +403,7 @@ def find_margin(
         # 0, 1, 2, … up to the first number that destabilises, or that the other rules imply.
         for mansd in range(most + 1):
             text = f"at most {mansd} lost in a row (up to {most})"
-            caps.append(LossCap(mansd, examine(capped(other_rules, mansd), text)))
+            caps.append(LossCap(mansd, examine(other_rules.capped(mansd), text)))
             decided(caps[-1])
             every_mansd = other_rules.longest_burst is not None and other_rules.longest_burst <= mansd
             if every_mansd or caps[-1].stability.verdict == "destabilised":

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from netem.core.errors import CallerError
 
 StateIndices = NDArray[np.int64]
+GuaranteeState = tuple[int, ...]
+"""The state of each rule."""
 
 _FORBIDDEN, _UNKNOWN = -1, -2
 """In place of the number of a next state: the outcome is not allowed, or has not been followed yet."""
@@ -154,6 +156,30 @@ class LossGuarantee:
     rules: tuple[LossRule, ...] = ()
 
     @property
+    def start(self) -> GuaranteeState:
+        """The state before the first packet."""
+        return tuple(rule.start for rule in self.rules)
+
+    def after(self, state: GuaranteeState, *, lost: bool) -> GuaranteeState | None:
+        """Return the state after an outcome; None: it is not allowed."""
+        following = []
+        for rule, rule_state in zip(self.rules, state, strict=True):
+            next_state, value = rule.after(rule_state, lost)
+            if value > rule.limit:
+                return None
+            following.append(next_state)
+        return tuple(following)
+
+    @property
+    def uncapped(self) -> "LossGuarantee":
+        """The rules besides the maximum number of consecutive losses."""
+        return LossGuarantee(tuple(rule for rule in self.rules if not isinstance(rule, LongestBurst)))
+
+    def capped(self, losses: int) -> "LossGuarantee":
+        """Return the guarantee with another maximum number of consecutive losses."""
+        return LossGuarantee((LongestBurst(losses), *self.uncapped.rules))
+
+    @property
     def longest_burst(self) -> int | None:
         """The largest number of consecutive losses; None without a limit."""
         bursts = [
@@ -212,10 +238,9 @@ class LossAutomaton:
     """
 
     def __init__(self, guarantee: LossGuarantee) -> None:
-        self._rules = guarantee.rules
-        start = tuple(rule.start for rule in self._rules)
-        self._states = [start]
-        self._numbers = {start: 0}
+        self._guarantee = guarantee
+        self._states = [guarantee.start]
+        self._numbers = {guarantee.start: 0}
         self._next: StateIndices = np.full((1, 2), _UNKNOWN)
 
     def after_loss(self, states: StateIndices) -> StateIndices:
@@ -234,15 +259,11 @@ class LossAutomaton:
             following = self._next[states, lost]
         return following
 
-    def _number(self, state: tuple[int, ...], lost: bool) -> int:
+    def _number(self, state: GuaranteeState, lost: bool) -> int:
         """Return the number of the state after an outcome; −1 if it is not allowed."""
-        following = []
-        for rule, rule_state in zip(self._rules, state, strict=True):
-            next_state, value = rule.after(rule_state, lost)
-            if value > rule.limit:
-                return _FORBIDDEN
-            following.append(next_state)
-        key = tuple(following)
+        key = self._guarantee.after(state, lost=lost)
+        if key is None:
+            return _FORBIDDEN
         if key not in self._numbers:
             self._numbers[key] = len(self._states)
             self._states.append(key)

@@ -53,7 +53,7 @@ class ScheduleBounds(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Schedule:
+class LoopSchedule:
     """The schedule of a loop."""
 
     step: Period

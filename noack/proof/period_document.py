@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netem.guarantee.loss_guarantee import LossRule
+from netem.guarantee.loss_guarantee import LossGuarantee
 from noack.core.linear_systems import Matrix, Vector
 from noack.proof.loop_document import FORMAT, NoDocumentError
 from noack.proof.numbers import as_written, quotient
@@ -133,15 +133,15 @@ class PeriodDocument:
 
     Args:
         loop: the loop.
-        rules: of the guarantee.
+        guarantee: the outcomes that are allowed.
         rate: r of the bounds, 1/s.
 
     Raises:
         NoDocumentError: it would be too large.
     """
 
-    def __init__(self, loop: PeriodLoop, rules: Sequence[LossRule], rate: float = 0.0) -> None:
-        self.loop, self._rules, self._rate = loop, tuple(rules), rate
+    def __init__(self, loop: PeriodLoop, guarantee: LossGuarantee, rate: float = 0.0) -> None:
+        self.loop, self._guarantee, self._rate = loop, guarantee, rate
         self.outcomes: dict[str, tuple[bool, int]] = {}
         """Of each edge: whether an update is delivered, and the slot of its beginning."""
         self.lost: dict[str, int] = {}
@@ -162,8 +162,7 @@ class PeriodDocument:
             return
         if times.timeout < NEVER or self.loop.knows_start:
             raise NoDocumentError("times between events that vary, with a timeout or a known start")
-        latest = max(max(times.arrivals(slot)) for slot in range(times.slots))
-        if times.behind * times.period + latest >= shortest:
+        if times.behind * times.period + times.latest >= shortest:
             raise NoDocumentError("updates that are on their way at the next event, at times that vary")
 
     @property
@@ -289,8 +288,7 @@ class PeriodDocument:
 
     def _table(self) -> Table:
         loop, f1, f2 = self.loop, "f1", "f2"
-        state = tuple(rule.start for rule in self._rules)
-        first = _PeriodPlace(state, 0, 0, starting=0)
+        first = _PeriodPlace(self._guarantee.start, 0, 0, starting=0)
         self._places[first] = self._name(first)
         pending = [first]
         while pending:
@@ -394,7 +392,7 @@ class PeriodDocument:
                 follows = target._replace(starting=None, lost=0)
             yield from self._walks(place, follows, periods, None, "")
             return
-        delivered = self._after(place.state, lost=False)
+        delivered = self._guarantee.after(place.state, lost=False)
         if delivered is not None:
             arrivals = sorted({*times.arrivals(place.slot)})
             for arrival in arrivals:
@@ -402,19 +400,10 @@ class PeriodDocument:
                 follows = target._replace(state=delivered, lost=0, starting=None)
                 arrival += (times.behind - behind) * times.period
                 yield from self._walks(place, follows, periods, arrival, words)
-        lost = self._after(place.state, lost=True)
+        lost = self._guarantee.after(place.state, lost=True)
         if lost is not None and place.starting is None:
             follows = target._replace(state=lost, lost=place.lost + 1)
             yield from self._walks(place, follows, periods, None, "lost")
-
-    def _after(self, state: tuple[int, ...], *, lost: bool) -> tuple[int, ...] | None:
-        found = []
-        for rule, value in zip(self._rules, state, strict=True):
-            following, compared = rule.after(value, lost)
-            if lost and compared > rule.limit:
-                return None
-            found.append(following)
-        return tuple(found)
 
     def _walks(
         self, place: _PeriodPlace, target: _PeriodPlace, periods: int, arrival: int | None, words: str

@@ -95,3 +95,13 @@ class LoopTimes(NamedTuple):
                 raise ArrivalAtTransmissionError
             found.append(other)
         return found
+
+    @property
+    def latest(self) -> int:
+        """The longest time from a transmission to an arrival, without whole periods."""
+        return max(max(self.arrivals(slot)) for slot in range(self.slots))
+
+    @property
+    def has_ties(self) -> bool:
+        """Whether an update may act at one of two ticks."""
+        return any(len(self.arrivals(slot)) > 1 for slot in range(self.slots))

@@ -16,7 +16,7 @@ from netem.core.number_format import as_html, as_text
 from netem.core.periods import Period, exact_ns, period_of, whole_ns
 from netem.core.settings_section import FolderName, ScenarioSection
 from noack.controllers.linear_feedback import LinearFeedbackSettings
-from noack.core.schedule import Schedule, first_tick_ns
+from noack.core.schedule import LoopSchedule, first_tick_ns
 from noack.plants.linear import LinearSettings
 from noack.protocol.roles import PROTOCOLS, LoopProtocol
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
@@ -257,10 +257,10 @@ class Timing:
 
     def schedule(
         self, late_periods: int = 0, network_delay_s: float = 0.0, input_gap_ns: int = 0
-    ) -> Schedule:
+    ) -> LoopSchedule:
         """Return steps, measurements and ticks with what lateness, delays and lost inputs may add."""
         plant, controller = self.scenario.plant, self.scenario.controller
-        return Schedule(
+        return LoopSchedule(
             self.plant_period,
             plant.measure_every,
             self.controller_period,

@@ -19,7 +19,7 @@ from cosim.analysis.witness_store import WitnessStore
 from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
 from netem.core.periods import period_of
 from noack.core.balls import matrix
-from noack.core.schedule import Schedule
+from noack.core.schedule import LoopSchedule
 from noack.proof.elaborate.loop import Loop
 from noack.proof.elaborate.scenario import Enclosed, read_loop, read_region
 from noack.proof.gains_document import gains_files
@@ -143,7 +143,7 @@ def at_rate_0(floor: float) -> Loop:
     return with_rule(double_integrator(IDEAL, floor=floor), rate=arb(0))
 
 
-_SCHEDULE = Schedule(period_of(100.0), 1, period_of(50.0), 0.0, network_delay_s=0.01)
+_SCHEDULE = LoopSchedule(period_of(100.0), 1, period_of(50.0), 0.0, network_delay_s=0.01)
 UNTIL_IT_ACTS = fmpq(_SCHEDULE.bounds.delay_ns, 10**9)
 """An update is 10 ms in the network, waits up to 20 ms for a tick, whose input acts at the next step."""
 _TESTED = IDEAL._replace(sampling=fmpq(1, 100), least_sampling=fmpq(1, 100), delay=fmpq(1, 100))

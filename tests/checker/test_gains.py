@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from netem.core.periods import period_of
 from noack.core.balls import beside, identity, matrix, number, zeros
-from noack.core.schedule import Schedule
+from noack.core.schedule import LoopSchedule
 from noack.proof.elaborate.errors import RejectedError
 from noack.proof.elaborate.loop import Loop, Memory
 from noack.proof.search.results import Proof, smallest_bounds
@@ -341,7 +341,7 @@ STEADY = scalar(0, SCHEDULE, floor=0.02)._replace(pushes=identity(1), sizes=(num
 QUIET = scalar(0, SCHEDULE._replace(start=fmpq(0)), level=1e-3)
 """What moves e_s beside the errors themselves shows at once."""
 NETWORK_S = fmpq(1, 50)
-_OF_INPUTS = Schedule(period_of(100.0), 1, period_of(10.0), 0.0, network_delay_s=0.02, input_gap_ns=10**7)
+_OF_INPUTS = LoopSchedule(period_of(100.0), 1, period_of(10.0), 0.0, network_delay_s=0.02, input_gap_ns=10**7)
 UNTIL_IT_ACTS = fmpq(_OF_INPUTS.bounds.delay_ns, 10**9)
 """20 ms in the network, up to 100 ms until a tick, 10 ms on the way of its input: 130 ms."""
 LIES: dict[str, tuple[Loop, Callable[[Loop], Loop]]] = {

@@ -11,15 +11,18 @@ import numpy as np
 import pytest
 
 from cosim.analysis.witnesses import resolved_content
+from netem.core.errors import CallerError
+from netem.guarantee.loss_guarantee import LongestBurst, LossesInWindow, LossGuarantee
 from noack.core.linear_systems import Matrix
-from noack.proof.elaborate.errors import RefusedError, RejectedError
-from noack.proof.period_times import LoopTimes
-from noack.proof.search.growth import PeriodicLoop, prove_growth, read_periodic_loop
+from noack.proof.elaborate.errors import RejectedError
+from noack.proof.search.growth import PeriodicLoop, prove_growth
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from noack.theory.time_triggered.time_triggered_loop import TimeTriggeredLoop
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.growth import enclose_growth
+from noack.theory.witnesses.loss_margin import LossMargin
 from noack_kernel.__main__ import verify
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import shipped
@@ -45,8 +48,12 @@ def scenario(name: str, *settings: str) -> Scenario:
 
 
 def periodic(name: str, *settings: str) -> PeriodicLoop:
-    resolved = scenario(name, *settings)
-    return read_periodic_loop(resolved_content(resolved))
+    return LossMargin(scenario(name, *settings)).bursts_loop
+
+
+def loop_from(content: Mapping[str, object]) -> PeriodicLoop:
+    """Return the loop of a resolved scenario's tables."""
+    return LossMargin(resolve(validate(content, "changed"))).bursts_loop
 
 
 def test_a_set_point_does_not_change_the_growth() -> None:
@@ -54,7 +61,7 @@ def test_a_set_point_does_not_change_the_growth() -> None:
     resolved = scenario("lane_periodic", "controller.setpoint=[0.0, 0.0, 0.0, 3.5]")
     at_rest = matrices(periodic("lane_periodic"))
     for content in (resolved.content(), resolved_content(resolved)):
-        np.testing.assert_array_equal(matrices(read_periodic_loop(content)), at_rest)
+        np.testing.assert_array_equal(matrices(loop_from(content)), at_rest)
     words = ("margin", "double_integrator", "--set", PERIODIC, "--no-period", "--most", "2")
     moved = invoke(*words, "--set", "controller.setpoint=[2, 0]")
     assert moved.stdout == invoke(*words).stdout
@@ -63,10 +70,8 @@ def test_a_set_point_does_not_change_the_growth() -> None:
 def matrices(loop: PeriodicLoop) -> tuple[list[Matrix], list[Matrix]]:
     """The matrices of a unit with and without an arrival, by slot, from the scenario's times alone."""
     A, B, K, H = map(floats, loop.matrices)
-    t = loop.times
-    times = LoopTimes(t.step, t.tick, t.phase, t.unit, t.rest, parts=t.parts, behind=t.behind)
-    exact = TimeTriggeredLoop(A, B, K, H, times)
-    delivered, lost = ([exact.period(slot, fate).middle for slot in range(t.slots)] for fate in (True, False))
+    exact, slots = TimeTriggeredLoop(A, B, K, H, loop.times), range(loop.times.slots)
+    delivered, lost = ([exact.period(slot, fate).middle for slot in slots] for fate in (True, False))
     return delivered, lost
 
 
@@ -89,11 +94,9 @@ def worst_growth(loop: PeriodicLoop) -> tuple[float, str]:
 
 def allows(loop: PeriodicLoop, outcomes: str) -> bool:
     """Whether no part of the outcomes has too many losses, from what the rules say."""
-    guarantee = loop.guarantee
-    rules = [(guarantee.losses, guarantee.losses + 1), *guarantee.windows]
     return all(
         outcomes[begin : begin + window].count("L") <= most
-        for most, window in rules
+        for most, window in loop.guarantee.windows
         for begin in range(len(outcomes))
     )
 
@@ -183,12 +186,12 @@ def test_what_is_accepted_of_changed_witnesses_is_true(seed: int, count: int) ->
     rng = np.random.default_rng(seed)
     resolved = scenario(*SMALL)
     content = resolved_content(resolved)
-    loop = read_periodic_loop(content)
+    loop = loop_from(content)
     document, _ = accepted(loop)
     rejected = 0
     for number in range(count):
         is_scenario = number % 2 == 0
-        other_loop = read_periodic_loop(changed_scenario(content, rng)) if is_scenario else loop
+        other_loop = loop_from(changed_scenario(content, rng)) if is_scenario else loop
         other = document if is_scenario else changed_document(document, rng)
         try:
             what = prove_growth(other_loop, other)
@@ -196,7 +199,7 @@ def test_what_is_accepted_of_changed_witnesses_is_true(seed: int, count: int) ->
             rejected += 1
             continue
         assert what.upper is not None
-        checked = other_loop.under(other_loop.guarantee._replace(losses=what.losses))
+        checked = other_loop.under(other_loop.guarantee.capped(what.losses))
         assert worst_growth(checked)[0] <= float(what.upper)
     assert count // 6 < rejected < count
 
@@ -245,21 +248,21 @@ def changed_pattern(document: Mapping[str, object], rng: np.random.Generator) ->
 def test_what_is_accepted_of_changed_patterns_grows(count: int) -> None:
     rng = np.random.default_rng(5)
     content = resolved_content(scenario(*UNSTABLE))
-    loop = read_periodic_loop(content)
+    loop = loop_from(content)
     document, bound = accepted(loop)
     assert bound > 1.5
     document["unstable"].setdefault("coordinates", np.eye(loop.size).tolist())  # type: ignore[attr-defined]
     found = []
     for number in range(count):
         is_scenario = number % 5 == 0
-        other_loop = read_periodic_loop(changed_scenario(content, rng)) if is_scenario else loop
+        other_loop = loop_from(changed_scenario(content, rng)) if is_scenario else loop
         other = document if is_scenario else changed_pattern(document, rng)
         try:
             what = prove_growth(other_loop, other)
         except RejectedError:
             continue
         assert what.lower is not None
-        checked = other_loop.under(other_loop.guarantee._replace(losses=what.losses))
+        checked = other_loop.under(other_loop.guarantee.capped(what.losses))
         assert allows(checked, what.pattern * 3)
         assert float(what.lower) <= growth_of(checked, what.pattern) * (1 + 1e-9)
         found.append(float(what.lower))
@@ -270,19 +273,18 @@ def test_what_is_accepted_of_changed_patterns_grows(count: int) -> None:
 @pytest.mark.parametrize("settings", [("double_integrator", PERIODIC), UNSTABLE])
 def test_what_is_accepted_of_other_windows_is_true(settings: Sequence[str]) -> None:
     """A guarantee allows so many losses in so many successive updates; with others it is another loop."""
-    content = resolved_content(scenario(*settings, *within(2, 5)))
-    document, proven, rejected = accepted(read_periodic_loop(content))[0], 0, 0
+    given = periodic(*settings, *within(2, 5))
+    document, proven, rejected = accepted(given)[0], 0, 0
     for number, (most, window) in enumerate(product(range(5), range(1, 8))):
-        limits = [{"kind": "at_most", "losses": most, "window": window}]
-        loop = read_periodic_loop({**content, "network": content["network"] | {"constraints": limits}})
-        losses = min(loop.guarantee.losses, 2 + number % 2)
+        loop = given.under(LossGuarantee((LongestBurst(9), LossesInWindow(most, window))))
+        losses = min(most, 2 + number % 2) if most < window else 2 + number % 2
         try:
             what = prove_growth(loop, with_forms_for(loop, {**document, "losses": losses}))
         except RejectedError:
             rejected += 1
             continue
         proven += 1
-        checked = loop.under(loop.guarantee._replace(losses=losses))
+        checked = loop.under(loop.guarantee.capped(losses))
         if what.upper is not None:
             assert worst_growth(checked)[0] <= float(what.upper)
         else:
@@ -296,7 +298,7 @@ def with_forms_for(loop: PeriodicLoop, document: dict[str, Any]) -> dict[str, ob
     """Return a document with as many forms as a loop needs: an inequality decides, not their number."""
     if "stable" not in document:
         return document
-    checked, table = loop.under(loop.guarantee._replace(losses=document["losses"])), document["stable"]
+    checked, table = loop.under(loop.guarantee.capped(document["losses"])), document["stable"]
     nodes = {burst.source for burst in checked.bursts}
     forms = [table["forms"][node % len(table["forms"])] for node in range(len(nodes))]
     return {**document, "stable": table | {"forms": forms}}
@@ -355,16 +357,25 @@ def test_a_decaying_pattern_is_not_called_unstable() -> None:
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        (("trigger={policy='absolute', delta=0.1}",), "has no longest time"),
-        ((PERIODIC, "network.impairments=[{kind='delay', delay_s=0.01, jitter_s=0.005}]"), "not constant"),
+        (("trigger={policy='absolute', delta=0.1}",), "needs a longest time"),
+        (
+            (PERIODIC, "network.impairments=[{kind='delay', delay_s=0.01, jitter_s=0.005}]"),
+            "needs a constant delay",
+        ),
         ((PERIODIC, "plant.rate_hz=50", "controller.rate_hz=49.99"), "repeat only after too many steps"),
         ((PERIODIC, "controller.update_timeout_s=1", delayed(0.2)), "update_timeout_s: not covered with"),
-        ((PERIODIC, "plant.disturbances=[{kind='uniform', bound=[0.1]}]"), "without observer, noise and"),
-        ((PERIODIC, "plant.measurement.noise_bound=[0.1, 0.1]"), "without observer, noise and"),
+        (
+            (PERIODIC, "plant.disturbances=[{kind='uniform', bound=[0.1]}]"),
+            "the plant is disturbed",
+        ),
+        (
+            (PERIODIC, "plant.measurement.noise_bound=[0.1, 0.1]"),
+            "is measured with noise",
+        ),
     ],
 )
 def test_what_is_not_covered_is_refused(settings: Sequence[str], reason: str) -> None:
-    with pytest.raises(RefusedError, match=reason):
+    with pytest.raises(CallerError, match=reason):
         periodic("double_integrator", *settings)
 
 
@@ -374,8 +385,8 @@ def test_an_observer_that_learns_nothing_is_not_called_stable() -> None:
     resolved = scenario("double_integrator", *plant, PERIODIC)
     content = resolved_content(resolved)
     content["observer"] = {"kind": "luenberger", "gain": [[0.0, 0.0]] * 2, "initial_estimate": [0.0, 0.0]}
-    with pytest.raises(RefusedError, match="observer"):
-        read_periodic_loop(content)
+    with pytest.raises(CallerError, match="observer"):
+        loop_from(content)
 
 
 def test_the_command_writes_what_noack_check_proves(

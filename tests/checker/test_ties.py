@@ -8,19 +8,17 @@ import pytest
 from cosim.analysis.mean_cost import find_mean_cost
 from cosim.simulation.virtual_time import simulate
 from netem.core.errors import CallerError
-from netem.guarantee.loss_guarantee import LongestBurst
+from netem.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from netem.impairments.target_loss import loss_process
 from noack.core.linear_systems import Matrix
 from noack.proof.period_document import PeriodDocument
 from noack.proof.period_graph import PeriodGraph
-from noack.proof.search.growth import LATENCY_NS
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
-from noack.scenario import arrival_ties
 from noack.scenario.arrival_ties import late_inputs, with_later_updates
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.random_losses.mean_square_growth import growth_without_guarantee
-from noack.theory.witnesses.loss_margin import LossMargin, capped
+from noack.theory.witnesses.loss_margin import LossMargin
 
 CASE = Path(__file__).parents[1] / "cases" / "drive_tie.toml"
 """A packet every 10 ms arrives 25 ms later, at a tick of the controller, 5 ms after a transmission."""
@@ -77,16 +75,16 @@ def test_either_outcome_is_that_of_a_loop_without_the_tie(
 
 def maps(loop: LossMargin) -> dict[str, Matrix]:
     """Return the map of each edge of a document with three losses."""
-    document = PeriodDocument(loop.period_loop, (LongestBurst(3),))
+    document = PeriodDocument(loop.period_loop, LossGuarantee((LongestBurst(3),)))
     return {edge.name: edge.map for edge in PeriodGraph(document.table).edges}
 
 
 def test_more_losses_are_not_proven_than_with_both_outcomes() -> None:
     """With early arrivals alone 13 losses are proven, and are false of a live run."""
     loop = margin(LATENESS.format(0))
-    assert loop.stability(capped(loop.guarantee, 3), 0.03).verdict == "stable"
-    assert loop.stability(capped(loop.guarantee, 11), 0.03).verdict == "stable"
-    assert loop.stability(capped(loop.guarantee, 13), 0.03, effort=0.1).verdict == "destabilised"
+    assert loop.stability(loop.guarantee.capped(3), 0.03).verdict == "stable"
+    assert loop.stability(loop.guarantee.capped(11), 0.03).verdict == "stable"
+    assert loop.stability(loop.guarantee.capped(13), 0.03, effort=0.1).verdict == "destabilised"
 
 
 @pytest.mark.parametrize("late", [0, 1, 3])
@@ -102,16 +100,15 @@ def test_inputs_may_act_some_steps_late(late: int) -> None:
 def test_updates_expire_that_are_on_their_way_for_several_periods() -> None:
     """A tick is 2.5 ms after a transmission, and the newest update that has arrived 32.5 ms old, or older."""
     loop = margin(EXPIRES, LATENESS.format(0), "controller.phase=0.25", LATER)
-    document = PeriodDocument(loop.period_loop, (LongestBurst(5),))
+    document = PeriodDocument(loop.period_loop, LossGuarantee((LongestBurst(5),)))
     edges = {edge["name"]: edge["jump"] for edge in document.table["edges"]}
     safe = [name for name, steps in edges.items() if "safe tick" in steps]
     outcomes = (f"{lost} lost, {outcome}" for lost in (3, 4, 5) for outcome in ("delivered", "lost"))
     assert safe == [*outcomes][:-1]
-    assert loop.stability(capped(loop.guarantee, 3), 0.03).verdict == "stable"
+    assert loop.stability(loop.guarantee.capped(3), 0.03).verdict == "stable"
 
 
 def test_a_simulation_takes_the_later_tick_and_says_so() -> None:
-    assert arrival_ties.LATENCY_NS == LATENCY_NS
     scenario, text = with_later_updates(load(CASE, ["horizon_s=1.0"]))
     assert text == (
         "an update may arrive at a tick of the controller, or up to 0.2 ms before: a live run may use it at "

@@ -14,7 +14,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.witnesses.coordinates import floats
-from noack.theory.witnesses.loss_margin import LossMargin, checked_guarantee
+from noack.theory.witnesses.loss_margin import LossMargin
 
 GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
 
@@ -71,7 +71,7 @@ def random_loop(seed: int) -> RandomLoop:
     if number >= 2:
         words += f" recover {rng.integers(2, 4)}"
     guarantee = read_guarantee(words)
-    growth = _fastest(margin.bursts_loop.under(checked_guarantee(guarantee)))
+    growth = _fastest(margin.bursts_loop.under(guarantee))
     return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[number]}", growth)
 
 

@@ -5,9 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from flint import arb_mat
 
+from netem.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.core.balls import matrix
 from noack.core.linear_systems import Matrix
-from noack.proof.search.growth import Burst, GuaranteeAutomaton, PeriodicLoop, TransmissionTimes
+from noack.proof.period_times import LoopTimes
+from noack.proof.search.growth import Burst, PeriodicLoop
 from noack.theory.time_triggered.graph import Graph
 from noack.theory.witnesses.growth import enclose_growth
 
@@ -19,12 +21,12 @@ class SwitchedLoop(PeriodicLoop):
         self.matrices_of = [np.array(M, dtype=float) for _, _, M in edges]
         # Ticks are far from transmissions, so that each update has one outcome.
         period = 10**9
-        self.times = TransmissionTimes(period, period, period // 2, period, 0, 0, None, False, 1)
+        self.times = LoopTimes(period, period, period // 2, period, 0)
         self.between = range(1, 2)
-        self.guarantee, self.size = GuaranteeAutomaton(0), len(self.matrices_of[0])
+        self.guarantee, self.size = LossGuarantee((LongestBurst(0),)), len(self.matrices_of[0])
         self.bursts = [Burst(v, w, number, 0, 0, 1) for number, (v, w, _) in enumerate(edges)]
 
-    def under(self, guarantee: GuaranteeAutomaton) -> "SwitchedLoop":
+    def under(self, guarantee: LossGuarantee) -> "SwitchedLoop":
         """Return the same system."""
         return self
 

@@ -29,8 +29,8 @@ from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.values import MatrixRows, rows_of
 from noack.theory.coverage import require_exact
-from noack.theory.time_triggered.scenario_times import loop_times, without_timeout
-from noack.theory.witnesses.loss_margin import LossMargin, Stability, capped, checked_guarantee, uncapped
+from noack.theory.time_triggered.scenario_times import without_timeout
+from noack.theory.witnesses.loss_margin import LossMargin, Stability
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
 COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
@@ -118,7 +118,7 @@ class NetworkSearch:
         self.plant, margin = loop_of(resolved), LossMargin(resolved)
         self.measurements, self._loop = margin.longest, margin.bursts_loop
         """From an update to the next one."""
-        self._times = loop_times(resolved, margin.longest)
+        self._times = self._loop.times
         self._latest = [max(self._loop.times.arrivals(slot)) for slot in range(self._times.slots)]
         self.period_s = margin.seconds(margin.longest)
         if margin.shortest < margin.longest:
@@ -127,7 +127,7 @@ class NetworkSearch:
                 "updates; give their --period"
             )
         # More losses in a row than the constraints allow mean nothing.
-        burst = uncapped(resolved.network.guarantee).longest_burst
+        burst = resolved.network.guarantee.uncapped.longest_burst
         self.most = request.most if burst is None else min(request.most, burst)
         n, m = self.plant.n, self.plant.m
         self.weights = request.weights or (np.eye(n), np.eye(m))
@@ -140,7 +140,7 @@ class NetworkSearch:
 
     def guarantee(self, mansd: int) -> LossGuarantee:
         """Return the guarantee with another limit, and the network's further constraints."""
-        return capped(self.scenario.network.guarantee, mansd)
+        return self.scenario.network.guarantee.capped(mansd)
 
     def quick_loop(self, K: MatrixRows) -> QuickLoop:
         """Return the loop of a gain in double precision."""
@@ -152,8 +152,7 @@ class NetworkSearch:
 
     def _new_graph(self, mansd: int) -> PatternGraph:
         """Return the loss patterns of a limit, which keep those that were the worst."""
-        guarantee = checked_guarantee(self.guarantee(mansd))
-        return PatternGraph(list_bursts(guarantee, self._loop.times, self._loop.between))
+        return PatternGraph(list_bursts(self.guarantee(mansd), self._loop.times, self._loop.between))
 
     def growth(self, K: MatrixRows, mansd: int) -> float:
         """Return a lower bound of the logarithm of the growth per period."""

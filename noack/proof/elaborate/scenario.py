@@ -26,7 +26,7 @@ from noack.core.balls import (
     transpose,
     zeros,
 )
-from noack.core.schedule import Schedule
+from noack.core.schedule import LoopSchedule
 from noack.proof.elaborate.errors import RefusedError, RejectedError
 from noack.proof.elaborate.keys import Table, refusals
 from noack.proof.elaborate.loop import Along, Loop, LoopObserver, Memory, Region, Rule, Times
@@ -496,7 +496,7 @@ def _due_ns(trigger: Table) -> tuple[int, int]:
     return (times.longest, times.longest) if is_due_first else (0, 0)
 
 
-def read_schedule(resolved: Table) -> Schedule:
+def read_schedule(resolved: Table) -> LoopSchedule:
     """Return the schedule of a resolved scenario."""
     plant, controller, certificate = (_table(resolved, key) for key in ("plant", "controller", "certificate"))
     name = "controller.predictions"
@@ -512,7 +512,7 @@ def read_schedule(resolved: Table) -> Schedule:
         direction, name = _table(network, "actuation"), "network.actuation"
         delay_ns = math.ceil(_constant_delay_ns(direction, name))
         gap_ns = most_losses(direction, name) * tick.longest_ns + delay_ns
-    return Schedule(
+    return LoopSchedule(
         step,
         max(_whole(plant, "plant.measure_every"), 1),
         tick,
@@ -531,23 +531,12 @@ def _seconds(time_ns: int) -> fmpq:
 def _require_stated_delay(resolved: Table) -> None:
     """Require that the delay of updates, where it is constant, is within the stated one."""
     try:
-        delay_ns = constant_delay_ns(resolved)
+        delay_ns = _constant_delay_ns(_table(resolved, "network"), "network")
     except RefusedError:
         return  # it varies: the run checks it
     stated_s = _real(_table(resolved, "certificate"), "certificate.network_delay_s") if delay_ns else 0.0
     if delay_ns > stated_s * NS_PER_S + 1:
         raise RefusedError("certificate.network_delay_s: the network delays each update by more")
-
-
-def constant_delay_ns(resolved: Table) -> Fraction:
-    """Return the delay of all updates in the network; raise RefusedError if it may vary.
-
-    In a loop whose periods are whole nanoseconds it is one, too.
-    """
-    total = _constant_delay_ns(_table(resolved, "network"), "network")
-    if total.denominator > 1 and read_schedule(resolved).is_whole:
-        raise RefusedError("network.impairments.delay_s: not a whole number of nanoseconds")
-    return total
 
 
 def _constant_delay_ns(direction: Table, name: str) -> Fraction:
@@ -560,59 +549,6 @@ def _constant_delay_ns(direction: Table, name: str) -> Fraction:
         elif kind not in _WITHOUT_DELAY:
             raise RefusedError(f"{name}.impairments: {kind}: the delay is not constant")
     return total
-
-
-def loss_rules(resolved: Table) -> tuple[tuple[tuple[int, int], ...], tuple[int, ...]]:
-    """Return the further rules of the guarantee.
-
-    They are the most losses of each window, with the number of its successive updates; and the least
-    numbers of deliveries between two bursts of losses.
-
-    Raises:
-        RefusedError: there is a rule of another kind.
-    """
-    windows, recoveries = [], []
-    for entry in _tables(_table(resolved, "network"), "network.constraints"):
-        if entry.get("kind") == "at_most":
-            windows.append(_window(entry))
-        elif entry.get("kind") == "recovery":
-            recoveries.append(_whole(entry, "network.constraints.deliveries"))
-        else:
-            raise RefusedError(f"network.constraints: {entry.get('kind')}: not covered")
-    return tuple(windows), tuple(recoveries)
-
-
-class UpdateTimeout(NamedTuple):
-    """From which age on an update is not used, in ns, and what is then applied."""
-
-    after_ns: Fraction | None
-    holds_input: bool
-
-
-def update_timeout(resolved: Table) -> UpdateTimeout:
-    """Return what becomes of the input if no update arrives."""
-    controller = _table(resolved, "controller")
-    holds = controller.get("timeout_input") == "hold"
-    if "update_timeout_s" not in controller:
-        return UpdateTimeout(None, holds)
-    after_ns = exact_ns(_real(controller, "controller.update_timeout_s"))
-    if not after_ns > 0:
-        raise RefusedError("controller.update_timeout_s: not above 0")
-    return UpdateTimeout(Fraction(int(after_ns)) if read_schedule(resolved).is_whole else after_ns, holds)
-
-
-def times_between_events(resolved: Table) -> tuple[int, int]:
-    """Return the least and the largest time between two events, whatever is compared, in ns.
-
-    Raises:
-        RefusedError: there is no largest one.
-    """
-    trigger = _table(resolved, "trigger")
-    times, policy = _intervals(trigger), _combined(trigger)[-1].get("policy")
-    if not times.longest:
-        raise RefusedError("trigger.policy: the sensor is not time-triggered, and has no longest time")
-    least = times.shortest if policy in ("periodic", "self_triggered") else max(times.dwell, 1)
-    return min(least, times.longest), times.longest
 
 
 _OF_REST = ("reference", "setpoint", "safe_input", "update_timeout_s", "timeout_input")
@@ -639,7 +575,7 @@ def read_linear_loop(resolved: Table) -> Loop:
     return loop
 
 
-def _require_watchdog(watchdog: Table, schedule: Schedule) -> None:
+def _require_watchdog(watchdog: Table, schedule: LoopSchedule) -> None:
     """Require that the plant's watchdog does not replace inputs as old as they may be.
 
     With the policy "hold" it applies the last one of the newest tick, which may have to wait for its time.

@@ -32,26 +32,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from math import ceil, gcd, lcm
+from math import gcd, lcm
 from typing import NamedTuple
 
-from flint import arb, arb_mat, fmpq
+from flint import arb, arb_mat
 
-from netem.core.clock import NS_PER_S
-from noack.core.balls import identity, is_positive, rows_of, stack, transpose, zeros
+from netem.guarantee.loss_guarantee import GuaranteeState, LossGuarantee
+from noack.core.balls import identity, is_positive, number, rows_of, stack, transpose, zeros
 from noack.proof.elaborate.errors import RefusedError, RejectedError
-from noack.proof.elaborate.keys import Table
-from noack.proof.elaborate.scenario import (
-    constant_delay_ns,
-    loss_rules,
-    read_linear_loop,
-    read_schedule,
-    times_between_events,
-    update_timeout,
-)
 from noack.proof.elaborate.tables import read_count, read_matrix, read_number, read_rows, read_table
+from noack.proof.period_times import LoopTimes
 
-_MOST_STEPS, _MOST_SLOTS, _MOST_SIZE, _MOST_UNITS = 20_000, 64, 80, 100_000
+_MOST_SLOTS, _MOST_SIZE, _MOST_UNITS = 64, 80, 100_000
 MOST_BURSTS = 5000
 _MOST_MEMORY, _LONGEST = 8, 1000
 _MOST_PRODUCTS = 5000
@@ -59,110 +51,8 @@ _MOST_PRODUCTS = 5000
 _LONGEST_PRODUCT = 40
 """Bursts of a product: balls become larger with each."""
 _MOST_SQUARINGS = 40
-LATENCY_NS = 200_000
-"""What arrives so near a tick may be before or after it in a live run, where it takes some 0.1 ms more."""
 _DEFINITE = arb(2) ** -100
 """A form is definite if it is positive with so much less."""
-
-State = tuple[int, tuple[int, ...], tuple[int, ...]]
-"""Losses in a row, the outcomes of each window as bits, deliveries since the last loss."""
-
-
-class GuaranteeAutomaton(NamedTuple):
-    """Which outcomes of successive updates are allowed."""
-
-    losses: int  # most consecutive losses
-    windows: tuple[tuple[int, int], ...] = ()  # most losses, in so many successive updates
-    recoveries: tuple[int, ...] = ()  # so many deliveries at least between two bursts of losses
-
-    @property
-    def start(self) -> State:
-        """The state before the first update, and after sufficiently many deliveries."""
-        return 0, (0,) * len(self.windows), self.recoveries
-
-    def after(self, state: State, *, lost: bool) -> State | None:
-        """Return the state after an outcome; None: it is not allowed."""
-        in_a_row, windows, since = state
-        recent = tuple(bits << 1 | lost for bits in windows)
-        if lost:
-            is_allowed = in_a_row < self.losses
-            is_allowed &= all(
-                bits.bit_count() <= most for bits, (most, _) in zip(recent, self.windows, strict=True)
-            )
-            is_allowed &= all(k in (0, least) for k, least in zip(since, self.recoveries, strict=True))
-            if not is_allowed:
-                return None
-        kept = tuple(
-            bits & ((1 << (window - 1)) - 1) for bits, (_, window) in zip(recent, self.windows, strict=True)
-        )
-        delivered = tuple(
-            0 if lost else min(k + 1, least) for k, least in zip(since, self.recoveries, strict=True)
-        )
-        return in_a_row + 1 if lost else 0, kept, delivered
-
-
-class TransmissionTimes(NamedTuple):
-    """The times of a loop, in whole parts of a nanosecond."""
-
-    step: int  # of the plant
-    tick: int  # of the controller
-    phase: int  # of its first tick
-    unit: int  # of transmissions; a multiple of a step
-    rest: int  # what is left of an update's delay after whole units
-    behind: int  # whole units of an update's delay
-    timeout: int | None  # age from which on an update is not used; None: it always is
-    holds_input: bool  # the input is then held; else it is 0
-    parts: int  # of a nanosecond
-
-    def seconds(self, duration: int) -> fmpq:
-        """Return a time in s."""
-        return fmpq(duration, self.parts * NS_PER_S)
-
-    @property
-    def slots(self) -> int:
-        """Number of units after which their times repeat, relative to the ticks."""
-        cycle = lcm(self.step, self.tick)
-        return cycle // gcd(cycle, self.unit)
-
-    def usable(self, units: int) -> int:
-        """Return how much longer an update is used that was sent so long ago; up to the delay."""
-        if self.timeout is None:
-            return self.latest
-        return min(max(self.timeout - units * self.unit, 0), self.latest)
-
-    def arrivals(self, slot: int) -> list[int]:
-        """Return how long after a transmission an update may arrive: nominally, and beyond a tick near it.
-
-        An arrival at a tick is before it. Nothing arrives before it is sent.
-
-        Raises:
-            RefusedError: one of them is in the period before or after.
-        """
-        begin, near = slot * self.unit, LATENCY_NS * self.parts
-        arrival = begin + self.rest
-        before = (arrival - self.phase) // self.tick * self.tick + self.phase
-        found = [self.rest]
-        for tick in (before, before + self.tick):
-            other = (tick if tick < arrival else tick + 1) - begin
-            if abs(tick - arrival) > near or (other < 0 and self.behind == 0):
-                continue
-            if not 0 <= other <= self.unit:
-                raise RefusedError(
-                    "network.impairments.delay_s: not covered if an update arrives within "
-                    f"{LATENCY_NS / 1e6:g} ms of a transmission and of a tick; change controller.phase"
-                )
-            found.append(other)
-        return found
-
-    @property
-    def has_ties(self) -> bool:
-        """Whether an update may act at one of two ticks."""
-        return any(len(self.arrivals(slot)) > 1 for slot in range(self.slots))
-
-    @property
-    def latest(self) -> int:
-        """The longest time from a transmission to an arrival, without whole units."""
-        return max(max(self.arrivals(slot)) for slot in range(self.slots))
 
 
 class Burst(NamedTuple):
@@ -179,7 +69,7 @@ class Burst(NamedTuple):
     """How long after the first transmission an update arrives; None: nominally."""
 
 
-def list_bursts(guarantee: GuaranteeAutomaton, times: TransmissionTimes, between: range) -> list[Burst]:
+def list_bursts(guarantee: LossGuarantee, times: LoopTimes, between: range) -> list[Burst]:
     """Return all bursts; node 0 is that of the first transmission.
 
     Of several with the same nodes and units, the one with the fewest losses stands for all.
@@ -192,8 +82,10 @@ def list_bursts(guarantee: GuaranteeAutomaton, times: TransmissionTimes, between
     Raises:
         RefusedError: there are more than 5,000.
     """
-    first = guarantee.after(guarantee.start, lost=False)
-    begin = first, 0, times.usable(1)
+    if between[-1] > _MOST_UNITS:
+        raise RefusedError("trigger: too many measurements between two events")
+    first, latest = guarantee.after(guarantee.start, lost=False), times.latest
+    begin = first, 0, times.usable(1, latest)
     numbers, pending = {begin: 0}, [begin]
     bursts: dict[tuple[int, int, int, int], Burst] = {}
     arrivals = [times.arrivals(slot) for slot in range(times.slots)]
@@ -204,7 +96,7 @@ def list_bursts(guarantee: GuaranteeAutomaton, times: TransmissionTimes, between
             sent += 1
             after = guarantee.after(state, lost=False)
             for units in range(sent * between[0], sent * between[-1] + 1):
-                target = after, (slot + units) % times.slots, times.usable(units)
+                target = after, (slot + units) % times.slots, times.usable(units, latest)
                 if target not in numbers:
                     numbers[target] = len(numbers)
                     pending.append(target)
@@ -246,15 +138,15 @@ def remembering(bursts: Sequence[Burst], memory: int) -> list[Burst]:
     """Return the graph in which a node also remembers the last bursts, so many of them."""
     for _ in range(memory):
         following: dict[int, list[int]] = {}
-        for number, burst in enumerate(bursts):
-            following.setdefault(burst.source, []).append(number)
+        for edge, burst in enumerate(bursts):
+            following.setdefault(burst.source, []).append(edge)
         ends = [following[burst.target] for burst in bursts]
         if sum(map(len, ends)) > MOST_BURSTS:
             raise RejectedError(f"memory: more than {MOST_BURSTS:,} transitions")
         bursts = [
-            bursts[number]._replace(source=source, target=number)
+            bursts[edge]._replace(source=source, target=edge)
             for source, numbers in enumerate(ends)
-            for number in numbers
+            for edge in numbers
         ]
     return list(bursts)
 
@@ -272,9 +164,9 @@ class PeriodicLoop:
     def __init__(
         self,
         matrices: tuple[arb_mat, arb_mat, arb_mat, arb_mat],
-        times: TransmissionTimes,
+        times: LoopTimes,
         between: range,
-        guarantee: GuaranteeAutomaton,
+        guarantee: LossGuarantee,
     ) -> None:
         self.matrices, self.times = matrices, times
         self.between, self.guarantee = between, guarantee
@@ -292,13 +184,15 @@ class PeriodicLoop:
         )
         sent = [x, *older]
         self._newest = sent[-1]
-        arrives_at_once = behind * times.unit + times.latest == 0
+        arrives_at_once = behind * times.period + times.latest == 0
         self._loop = stack([x, x_c, u, w])
         self._sent = stack(sent[:-1]) if behind else None
         # A step comes before a transmission, so that u = w there. What arrives at once replaces x_c.
         kept = [*range(n), *(() if arrives_at_once else range(n, 2 * n)), *range(2 * n, 2 * n + m)]
         kept += range(2 * (n + m), at[-1])
         self._kept, self.size = kept, len(kept)
+        if at[-1] > _MOST_SIZE:
+            raise RefusedError("too many updates are on their way at once")
         inputs = {2 * n + i: 2 * n + m + i for i in range(m)}
         self._from_kept = arb_mat(
             at[-1], len(kept), [int(i in (j, inputs.get(j))) for i in range(at[-1]) for j in kept]
@@ -308,7 +202,7 @@ class PeriodicLoop:
         self._after: dict[tuple[int, int, int], list[arb_mat]] = {}
         self._matrices: dict[tuple[int, int, int, int], arb_mat] = {}
 
-    def under(self, guarantee: GuaranteeAutomaton) -> "PeriodicLoop":
+    def under(self, guarantee: LossGuarantee) -> "PeriodicLoop":
         """Return the same loop with another guarantee."""
         other = PeriodicLoop.__new__(type(self))
         other.__dict__.update(self.__dict__)
@@ -321,13 +215,13 @@ class PeriodicLoop:
         """The graph of what may happen; see :func:`list_bursts`."""
         return list_bursts(self.guarantee, self.times, self.between)
 
-    def seconds(self, units: int) -> fmpq:
+    def seconds(self, units: int) -> Fraction:
         """Return a time in s."""
-        return self.times.seconds(units * self.times.unit)
+        return self.times.exact_seconds(units * self.times.period)
 
     def matrix(self, burst: Burst) -> arb_mat:
         """Return the matrix of z over a burst."""
-        arrival = self.times.rest if burst.arrival is None else burst.arrival
+        arrival = self.times.delay if burst.arrival is None else burst.arrival
         key = burst.slot, burst.usable, burst.units, arrival
         if key not in self._matrices:
             self._matrices[key] = self._over(*key)
@@ -335,17 +229,17 @@ class PeriodicLoop:
 
     def _over(self, slot: int, usable: int, units: int, arrival: int) -> arb_mat:
         states, T = self._after.setdefault((slot, usable, arrival), []), self.times
-        begin = slot * T.unit
-        expires = None if T.timeout is None else begin + T.timeout
+        begin = slot * T.period
+        expires = begin + T.timeout
         while len(states) < units:
-            now = begin + len(states) * T.unit
+            now = begin + len(states) * T.period
             if states:
-                state, step = states[-1], self._advance(now, now + T.unit, expires)
+                state, step = states[-1], self._advance(now, now + T.period, expires)
             else:
                 state, arrives = self._from_kept, now + arrival
-                before = self._advance(now, arrives, None if T.timeout is None else now + usable)
+                before = self._advance(now, arrives, now + usable)
                 # What arrives was sent before, and what is under way does not change until the end.
-                step = self._advance(arrives, now + T.unit, expires) * self._arrived(before, arrival)
+                step = self._advance(arrives, now + T.period, expires) * self._arrived(before, arrival)
             states.append(self._moved(step, state))
         return rows_of(states[units - 1], self._kept)
 
@@ -353,8 +247,8 @@ class PeriodicLoop:
         """Return the matrix until after an arrival, of what was sent at the start or before it."""
         n = self.matrices[0].nrows()
         x, rest = (rows_of(before, rows) for rows in (range(n), range(2 * n, before.nrows())))
-        delay_s = self.times.seconds(self.times.behind * self.times.unit + arrival)
-        return stack([x, (arb(delay_s) * self.matrices[3]).exp() * self._newest, rest])
+        delay_s = self.times.exact_seconds(self.times.behind * self.times.period + arrival)
+        return stack([x, (number(delay_s) * self.matrices[3]).exp() * self._newest, rest])
 
     def _moved(self, step: arb_mat, state: arb_mat) -> arb_mat:
         """Return the state after a unit, in which the newest x is under way, too."""
@@ -363,12 +257,12 @@ class PeriodicLoop:
             return after
         return stack([self._loop * after, self._sent * state])
 
-    def _advance(self, begin: int, end: int, expires: int | None) -> arb_mat:
+    def _advance(self, begin: int, end: int, expires: int) -> arb_mat:
         """Return the matrix between two times; a tick at the end is excluded, and a step at the start.
 
         From ``expires`` on the controller's update is too old.
         """
-        if expires is None or expires >= end:
+        if expires >= end:
             return self._without_arrival(begin, end, False)
         split = max(expires, begin)
         late = self._without_arrival(split, end, True)
@@ -387,28 +281,23 @@ class PeriodicLoop:
         return self._advances[key]
 
     def _events(self, begin: int, end: int, is_late: bool) -> arb_mat:
-        step, tick, phase = self.times.step, self.times.tick, self.times.phase
-        first = -(-(begin - phase) // tick) * tick + phase
-        events = [
-            *((t, self._step) for t in range((begin // step + 1) * step, end + 1, step)),
-            *((t, self._ticks[is_late]) for t in range(first, end, tick)),
-        ]
         state, now = self._whole, begin
-        for t, change in sorted(events, key=lambda event: event[0]):  # steps stand before ticks
+        for t, is_tick in self.times.occurrences(begin, end):
+            change = self._ticks[is_late] if is_tick else self._step
             state, now = change * (self._flow(t - now) * state), t
         return self._flow(end - now) * state
 
     def _flow(self, duration: int) -> arb_mat:
         if duration not in self._flows:
-            self._flows[duration] = (arb(self.times.seconds(duration)) * self._generator).exp()
+            self._flows[duration] = (number(self.times.exact_seconds(duration)) * self._generator).exp()
         return self._flows[duration]
 
 
 class Growth(NamedTuple):
     """What is proven: bounds of the factor over the longest time between two transmissions."""
 
-    period: fmpq  # s, the longest time
-    shortest: fmpq  # s
+    period: Fraction  # s, the longest time
+    shortest: Fraction  # s
     losses: int
     """Most consecutive losses of the patterns."""
     upper: arb | None
@@ -420,53 +309,6 @@ class Growth(NamedTuple):
     """Whether an update may act at one of two ticks, anew each time."""
 
 
-def read_periodic_loop(resolved: Table, longest: int | None = None) -> PeriodicLoop:
-    """Return the loop of a resolved scenario.
-
-    Args:
-        resolved: the scenario's tables, as tomllib returns them.
-        longest: most measurements between two transmissions; by default the trigger's.
-
-    Raises:
-        RefusedError: a key is not covered, is missing or has a wrong value.
-    """
-    loop, schedule = read_linear_loop(resolved), read_schedule(resolved)
-    step, tick, sample = (period.exact for period in (schedule.step, schedule.tick, schedule.sample))
-    least, most = (max(ceil(ns / sample), 1) for ns in times_between_events(resolved))
-    if longest is not None:
-        least, most = longest if least == most else min(least, longest), longest
-    measurements = most if least == most else 1
-    unit, delay = sample * measurements, constant_delay_ns(resolved)
-    timeout, behind = update_timeout(resolved), int(delay // unit)
-    rest = delay - behind * unit
-    exact = (step, tick, schedule.exact_phase, unit, rest, timeout.after_ns or Fraction(0))
-    parts = lcm(*(t.denominator for t in exact))
-    whole_step, whole_tick, first_tick, whole_unit, rest_of_delay, after = (int(t * parts) for t in exact)
-    times = TransmissionTimes(
-        step=whole_step,
-        tick=whole_tick,
-        phase=first_tick,
-        unit=whole_unit,
-        rest=rest_of_delay,
-        behind=behind,
-        timeout=None if timeout.after_ns is None else after,
-        holds_input=timeout.holds_input,
-        parts=parts,
-    )
-    if times.slots > _MOST_SLOTS or lcm(*times[:2]) // min(times[:2]) > _MOST_STEPS:
-        raise RefusedError("the times of the loop repeat only after too many steps")
-    if most > _MOST_UNITS:
-        raise RefusedError("trigger: too many measurements between two events")
-    if behind and times.timeout is not None:
-        raise RefusedError("controller.update_timeout_s: not covered with updates on their way for a period")
-    if 2 * (loop.n + loop.B.ncols()) + behind * loop.n > _MOST_SIZE:
-        raise RefusedError("too many updates are on their way at once")
-    between = range(least // measurements, most // measurements + 1)
-    windows, recoveries = loss_rules(resolved)
-    guarantee = GuaranteeAutomaton(loop.losses, windows, recoveries)
-    return PeriodicLoop((loop.A, loop.B, loop.gain, loop.H), times, between, guarantee)
-
-
 def prove_growth(loop: PeriodicLoop, document: Mapping[str, object]) -> Growth:
     """Return what a document proves of the growth of a loop, for as many losses as it says.
 
@@ -475,8 +317,8 @@ def prove_growth(loop: PeriodicLoop, document: Mapping[str, object]) -> Growth:
         RefusedError: the guarantee allows too many patterns.
     """
     upper = lower = None
-    pattern = ""
-    loop = loop.under(loop.guarantee._replace(losses=read_count(document, "losses", _LONGEST)))
+    pattern, losses = "", read_count(document, "losses", _LONGEST)
+    loop = loop.under(loop.guarantee.capped(losses))
     longest = loop.between[-1]
     if "stable" in document:
         upper = _prove_upper(loop, read_table(document, "stable")) ** longest
@@ -486,7 +328,7 @@ def prove_growth(loop: PeriodicLoop, document: Mapping[str, object]) -> Growth:
     if upper is None and lower is None:
         raise RejectedError("growth: neither stable nor unstable")
     shortest, has_ties = loop.seconds(loop.between[0]), loop.times.has_ties
-    return Growth(loop.seconds(longest), shortest, loop.guarantee.losses, upper, lower, pattern, has_ties)
+    return Growth(loop.seconds(longest), shortest, losses, upper, lower, pattern, has_ties)
 
 
 def _prove_upper(loop: PeriodicLoop, table: Mapping[str, object]) -> arb:
@@ -531,16 +373,16 @@ def _prove_lower(loop: PeriodicLoop, table: Mapping[str, object]) -> tuple[arb, 
     places = table.get("arrivals", [0] * len(bursts))
     if not isinstance(places, list) or len(places) != len(bursts):
         raise RejectedError("unstable: arrivals: not one for each delivery")
-    Π, units = identity(loop.size), 0
+    Π, units, latest = identity(loop.size), 0, loop.times.latest
     for _ in range(slots // gcd(slots, total)):
-        usable = loop.times.usable(bursts[-1])
+        usable = loop.times.usable(bursts[-1], latest)
         for burst, place in zip(bursts, places, strict=True):
             now = (slot + units) % slots
             arrivals = loop.times.arrivals(now)
             if type(place) is not int or not 0 <= place < len(arrivals):
                 raise RejectedError("unstable: arrivals: an update does not arrive then")
             Π = loop.matrix(Burst(0, 0, now, usable, 0, burst, arrivals[place])) * Π
-            usable, units = loop.times.usable(burst), units + burst
+            usable, units = loop.times.usable(burst, latest), units + burst
     if "coordinates" in table:
         T = read_rows(table, "coordinates")
         if (T.nrows(), T.ncols()) != (loop.size, loop.size):
@@ -557,7 +399,7 @@ def _prove_lower(loop: PeriodicLoop, table: Mapping[str, object]) -> tuple[arb, 
         raise RejectedError("unstable: the trace of the product is not above 0")
     text = pattern
     if len(loop.between) > 1:
-        seconds = (float(arb(loop.seconds(k)).mid()) for k in intervals)
+        seconds = (float(loop.seconds(k)) for k in intervals)
         text = " ".join(f"{letter} ({s:.6g} s)" for letter, s in zip(pattern, seconds, strict=True))
     return arb((least.log() / (units * 2**squarings)).exp()), text
 
@@ -572,11 +414,12 @@ def _pattern(loop: PeriodicLoop, table: Mapping[str, object]) -> tuple[str, list
         raise RejectedError("unstable: intervals: not one for each letter")
     if not all(type(k) is int and k in loop.between for k in intervals):
         raise RejectedError("unstable: intervals: not of the units that may be between two transmissions")
-    allowed = loop.guarantee
-    longest = max(allowed.losses, *(k for _, k in allowed.windows), *allowed.recoveries, 1)
-    state: State | None = allowed.start
-    for letter in pattern * (2 + longest // len(pattern)):
-        state = None if state is None else allowed.after(state, lost=letter == "L")
+    state: GuaranteeState | None = loop.guarantee.start
+    followed = set[GuaranteeState]()
+    while state is not None and state not in followed:
+        followed.add(state)
+        for letter in pattern:
+            state = None if state is None else loop.guarantee.after(state, lost=letter == "L")
     if state is None or "D" not in pattern:
         raise RejectedError("unstable: pattern: the guarantee does not allow it")
     if pattern[0] != "D":

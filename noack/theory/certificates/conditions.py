@@ -16,7 +16,7 @@ from netem.impairments.target_loss import loss_process
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix
 from noack.core.references import Reference
-from noack.core.schedule import Schedule
+from noack.core.schedule import LoopSchedule
 from noack.references.segment import SolutionSegment
 from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import loop_of, setpoint_of
@@ -71,7 +71,7 @@ class NetworkConditions(NamedTuple):
 def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkConditions:
     """Return the conditions of a scenario's schedule, with lateness up to ``late_periods`` steps.
 
-    The conditions are in the plant's time and hold for all rates: see :class:`noack.core.schedule.Schedule`.
+    The conditions are in the plant's time and hold for all rates (:class:`noack.core.schedule.LoopSchedule`).
     If the network delay has no bound, four times its jitter is used; a run with a longer delay violates the
     conditions. If losses of inputs have no bound, an input may be as old as the run.
     """
@@ -87,7 +87,7 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     )
 
 
-def schedule_of(resolved: Scenario, late_periods: int) -> Schedule:
+def schedule_of(resolved: Scenario, late_periods: int) -> LoopSchedule:
     """Return a scenario's schedule, with lateness up to some steps and the delays that are allowed for.
 
     If losses of inputs have no bound, they may be held up for the whole run.

@@ -173,7 +173,7 @@ def _with_forms(
             scaled = T * system.units
             forms = [(P + P.T).tolist() for P in scaled.swapaxes(1, 2) @ scaled / 2]
             stable = {"factor": growth * (1 + _ROUNDED), "memory": memory, "forms": forms}
-            document: Document = {"losses": loop.guarantee.losses, "stable": stable}
+            document: Document = {"losses": loop.guarantee.longest_burst, "stable": stable}
             try:
                 proven = prove_growth(loop, document)
             except RejectedError:
@@ -310,7 +310,7 @@ def unstable_document(loop: PeriodicLoop, path: Sequence[Burst]) -> tuple[Docume
             table["arrivals"] = arrivals
         if len(loop.between) > 1:
             table["intervals"] = intervals
-        document: Document = {"losses": loop.guarantee.losses, "unstable": table}
+        document: Document = {"losses": loop.guarantee.longest_burst, "unstable": table}
         try:
             return document, prove_growth(loop, document)
         except RejectedError as error:

@@ -15,16 +15,11 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from netem.core.errors import CallerError
-from netem.guarantee.loss_guarantee import (
-    DeliveriesBetweenBursts,
-    LongestBurst,
-    LossesInWindow,
-    LossGuarantee,
-    outcome_letters,
-)
+from netem.guarantee.loss_guarantee import LossGuarantee, outcome_letters
 from noack.proof.elaborate.errors import RefusedError
+from noack.proof.elaborate.scenario import read_linear_loop
 from noack.proof.loop_document import NoDocumentError
-from noack.proof.search.growth import GuaranteeAutomaton, PeriodicLoop, read_periodic_loop
+from noack.proof.search.growth import PeriodicLoop
 from noack.scenario.arrival_ties import LATENCY_NS
 from noack.scenario.scenario import Scenario
 from noack.theory.time_triggered.scenario_times import intervals, require_covered, require_usable_updates
@@ -106,26 +101,6 @@ class Stability(NamedTuple):
         )
 
 
-def uncapped(guarantee: LossGuarantee) -> LossGuarantee:
-    """Return the rules besides the maximum number of consecutive losses."""
-    return LossGuarantee(tuple(rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)))
-
-
-def capped(guarantee: LossGuarantee, losses: int) -> LossGuarantee:
-    """Return a guarantee with another maximum number of consecutive losses."""
-    return LossGuarantee((LongestBurst(losses), *uncapped(guarantee).rules))
-
-
-def checked_guarantee(guarantee: LossGuarantee) -> GuaranteeAutomaton:
-    """Return a guarantee as noack-check has it."""
-    rules, longest = guarantee.rules, guarantee.longest_burst
-    if longest is None:
-        raise CallerError(f"{guarantee.meaning}: needs a maximum of losses")
-    windows = ((rule.limit, rule.window) for rule in rules if isinstance(rule, LossesInWindow))
-    recoveries = (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts))
-    return GuaranteeAutomaton(longest, tuple(windows), tuple(recoveries))
-
-
 class LossMargin:
     """The loop of a scenario, with its own or another longest time between two transmissions.
 
@@ -168,10 +143,11 @@ class LossMargin:
         Raises:
             CallerError: the loop is not covered.
         """
-        times, longest = self.period_loop.times, self.longest
-        require_usable_updates(self._resolved, times)
+        require_usable_updates(self._resolved, self.period_loop.times)
         try:
-            return read_periodic_loop(self._resolved.content(), longest)
+            loop = read_linear_loop(self._resolved.content())
+            matrices = loop.A, loop.B, loop.gain, loop.H
+            return PeriodicLoop(matrices, self.period_loop.times, self.between, self.guarantee)
         except RefusedError as error:
             raise CallerError(str(error)) from None
 
@@ -183,7 +159,7 @@ class LossMargin:
     def ties(self) -> str:
         """Which order of an update and a tick is not known, as a sentence; empty: there is none."""
         times = self.period_loop.times
-        if all(len(times.arrivals(slot)) == 1 for slot in range(times.slots)):
+        if not times.has_ties:
             return ""
         return (
             f"an update arrives within {LATENCY_NS / 1e6:g} ms of a tick of the controller: it may act at "
@@ -244,12 +220,12 @@ class LossMargin:
                 self.period_loop, guarantee, accuracy / longest, decide=decide, effort=effort
             )
         except NoDocumentError:
-            loop = self.bursts_loop.under(checked_guarantee(guarantee))
+            loop = self.bursts_loop.under(guarantee)
             return self._of_bursts(loop, enclose_growth(loop, accuracy, decide=decide, effort=effort))
         stability = self._of_document(found)
         if len(self.between) == 1 or not decide or stability.verdict != "undecided":
             return stability
-        loop = self.bursts_loop.under(checked_guarantee(guarantee))
+        loop = self.bursts_loop.under(guarantee)
         return stability.refined(
             self._of_bursts(loop, enclose_growth(loop, accuracy, decide=decide, effort=effort))
         )

@@ -126,7 +126,7 @@ def prove_growth(
         NoDocumentError: the document would be too large.
         OverflowError: the loop grows too much between two transmissions.
     """
-    document = PeriodDocument(loop, guarantee.rules)
+    document = PeriodDocument(loop, guarantee)
     graph = PeriodGraph(document.table)
     search, text = GrowthSearch(graph), as_text(document.table)
     found = ProvenGrowth(0.0, np.inf, ())

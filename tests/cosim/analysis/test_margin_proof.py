@@ -15,7 +15,7 @@ from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from noack.theory.witnesses.loss_margin import LossMargin, capped
+from noack.theory.witnesses.loss_margin import LossMargin
 from noack_kernel import prove
 
 CASE = Path(__file__).parents[2] / "cases" / "drive_tie.toml"
@@ -31,7 +31,7 @@ def drive(*settings: str) -> Scenario:
 def proved(resolved: Scenario) -> MarginProof:
     """Return what is proven for the losses of a scenario."""
     margin, losses = LossMargin(resolved), resolved.network.mansd
-    found = [margin.stability(capped(margin.guarantee, k), 0.03) for k in range(losses + 1)]
+    found = [margin.stability(margin.guarantee.capped(k), 0.03) for k in range(losses + 1)]
     proof = margin_proof(margin, found, resolved.loop_outputs(), losses)
     assert proof is not None
     return proof

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from netem.core.periods import period_of
-from noack.core.schedule import Schedule
+from noack.core.schedule import LoopSchedule
 
 RATES_HZ = (1000.0, 500.0, 250.0, 200.0, 100.0, 50.0, 40.0, 25.0, 30.0, 60.0, 90.0, 120.0, 144.0, 59.94, 7.0)
 PHASES = (0.0, 0.5, 0.25, 1 / 3, 0.999)
@@ -19,15 +19,15 @@ _ROUNDING_NS = 4
 """A bound may be larger by so much where machines round periods: two times differ by 1 ns each, at most."""
 
 
-def random_schedule(rng: np.random.Generator, **allowed: float) -> Schedule:
+def random_schedule(rng: np.random.Generator, **allowed: float) -> LoopSchedule:
     step_hz = float(rng.choice(RATES_HZ))
     tick_hz = step_hz if rng.random() < 0.3 else float(rng.choice(RATES_HZ))
     phase = float(rng.choice(PHASES)) if rng.random() < 0.7 else float(rng.random())
     every = int(rng.choice([1, 1, 2, 5, 7]))
-    return Schedule(period_of(step_hz), every, period_of(tick_hz), phase, **allowed)  # type: ignore[arg-type]
+    return LoopSchedule(period_of(step_hz), every, period_of(tick_hz), phase, **allowed)  # type: ignore[arg-type]
 
 
-def times_of(schedule: Schedule) -> tuple[list[int], list[int], list[int]]:
+def times_of(schedule: LoopSchedule) -> tuple[list[int], list[int], list[int]]:
     """Return the times of steps, measurements and ticks as machines have them."""
     steps = schedule.step.times_ns(np.arange(STEPS)).tolist()
     count = steps[-1] // schedule.tick.lengths_ns[0] + 10
@@ -48,7 +48,7 @@ def from_event(event_ns: int, flight_ns: int, times: tuple[list[int], list[int],
     return None if acts is None else acts - event_ns
 
 
-def ages(schedule: Schedule, times: tuple[list[int], list[int], list[int]]) -> list[int]:
+def ages(schedule: LoopSchedule, times: tuple[list[int], list[int], list[int]]) -> list[int]:
     """Return the age of the input that acts, each time a step replaces it."""
     steps, _, ticks = times
     found = []
@@ -90,7 +90,7 @@ def test_nothing_takes_longer_with_delays_lateness_and_lost_inputs(seed: int) ->
     delay_s, input_delay_ns = float(rng.choice([0.0, 0.003, 0.02])), int(rng.choice([0, 0, 4_000_000]))
     plain = random_schedule(rng)
     gap_ns = lost * plain.tick.longest_ns + input_delay_ns
-    schedule = Schedule(
+    schedule = LoopSchedule(
         plain.step, plain.measure_every, plain.tick, plain.phase, late, delay_s, gap_ns,
         predictions=int(rng.integers(1, 4)) if gap_ns else 1,
     )  # fmt: skip
@@ -134,7 +134,7 @@ def test_nothing_takes_longer_with_delays_lateness_and_lost_inputs(seed: int) ->
     [(500.0, 1, 0.5), (30.0, 1, 0.1), (30.0, 1, 0.11), (59.94, 2, 0.25), (7.0, 1, 0.01), (120.0, 7, 1.0)],
 )
 def test_the_times_between_events_are_those_of_measurements(rate_hz: float, every: int, due_s: float) -> None:
-    schedule, due_ns = Schedule(period_of(rate_hz), every, period_of(100.0), 0.0), round(due_s * 1e9)
+    schedule, due_ns = LoopSchedule(period_of(rate_hz), every, period_of(100.0), 0.0), round(due_s * 1e9)
     measurements = schedule.sample.times_ns(np.arange(20_000)).tolist()
     found = {
         measurements[later] - begin

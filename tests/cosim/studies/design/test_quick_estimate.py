@@ -9,7 +9,7 @@ from cosim.studies.design.quick_estimate import PatternGraph
 from noack.scenario.arrival_ties import with_later_updates
 from noack.scenario.resolution import resolve
 from noack.theory.witnesses.coordinates import floats
-from noack.theory.witnesses.loss_margin import LossMargin, checked_guarantee
+from noack.theory.witnesses.loss_margin import LossMargin
 from tests.helpers.shipped import shipped
 
 
@@ -30,7 +30,7 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         given = shipped("double_integrator", *more)
         search = NetworkSearch(given, DesignRequest(period_s=0.31))
         exact = LossMargin(resolve(search.scenario))
-        loop = exact.bursts_loop.under(checked_guarantee(search.guarantee(5)))
+        loop = exact.bursts_loop.under(search.guarantee(5))
         bursts = loop.bursts
         quick = search.quick_loop(search.given_gain).maps(bursts)
         maps = np.array([floats(loop.matrix(burst)) for burst in bursts])

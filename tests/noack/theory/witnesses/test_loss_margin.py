@@ -81,7 +81,7 @@ def test_documents_are_those_of_a_simulated_run(name: str, settings: Sequence[st
     resolved = scenario(name, "horizon_s=6", "certificate.late_periods=0", *settings)
     margin = LossMargin(resolved)
     times, behind = margin.period_loop.times, margin.period_loop.times.behind
-    document = PeriodDocument(margin.period_loop, (LongestBurst(MOST_LOST),))
+    document = PeriodDocument(margin.period_loop, LossGuarantee((LongestBurst(MOST_LOST),)))
     graph, delay_ns = PeriodGraph(document.table), int(margin.delay_ns)
     rng, fates = np.random.default_rng(1), [True]
     while len(fates) < 1000:
