@@ -1,23 +1,19 @@
-"""Matrices with bounds of rounding: enclosures in double precision, and balls of 512 bits.
+"""Matrices with bounds of rounding, in double precision.
 
 :class:`IntervalMatrix`: entries are known up to a radius. A computed product of k terms differs
 from the exact one by at most k u/(1 − k u) times the product of the absolute values, u = 2⁻⁵³, in
 whichever order it is summed (Higham, *Accuracy and Stability of Numerical Algorithms*, section
 3.1). The bounds themselves are rounded too; they are enlarged by more than that can be, and by more
-than underflow can hide. Stacks of thousands of matrices are one product.
-
-:class:`BallMatrix`: a matrix of balls (python-flint). Products of hundreds of steps are computed with them,
-so that what remains is the rounding of the result to double precision.
+than underflow can hide. Stacks of thousands of matrices are one product; for single ones there are balls
+(:mod:`noack.core.balls`), of which :func:`enclosing` makes such a matrix.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from flint import arb, arb_mat, ctx, fmpq
+from flint import arb_mat
 from numpy.typing import NDArray
 
-from netem.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 
 _UNIT_ROUNDOFF = 2.0**-53
@@ -26,8 +22,6 @@ ENLARGED = 1 + 2.0**-40
 """Exceeds the rounding of a computed radius of up to 8,000 terms."""
 _UNDERFLOW = 1e-290
 """Exceeds what underflow hides of a term."""
-_BITS = 512
-"""Of a ball's midpoint: products of hundreds of steps lose far fewer."""
 _LARGEST_DOUBLE = int(np.finfo(np.float64).max)
 """The largest number in double precision."""
 
@@ -77,76 +71,22 @@ def exactly(matrix: Matrix) -> IntervalMatrix:
     return IntervalMatrix(matrix, np.zeros_like(matrix))
 
 
-def inverse(matrices: Matrix) -> IntervalMatrix | None:
-    """Enclose the inverses of invertible matrices, (…, n, n); None if that fails for one of them.
-
-    With an approximate inverse R and E = I − R M: M⁻¹ − R = E M⁻¹, so M⁻¹ differs from R by at most
-    ‖E‖∞/(1 − ‖E‖∞) times the largest entry of each column of R.
-    """
-    try:
-        approximate: Matrix = np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return None
-    errors = exactly(np.eye(matrices.shape[-1])) - exactly(approximate) @ exactly(matrices)
-    defects = errors.magnitude.sum(axis=-1).max(axis=-1)
-    if not (defects * ENLARGED < 0.5).all():
-        return None
-    shares = (defects / (1 - defects))[..., None, None]
-    columns = np.abs(approximate).max(axis=-2, keepdims=True) * shares * ENLARGED**4
-    return IntervalMatrix(approximate, np.broadcast_to(columns, matrices.shape).copy())
-
-
-@dataclass(frozen=True)
-class BallMatrix:
-    """All matrices whose entries are in balls, with midpoints of 512 bits."""
-
-    balls: arb_mat
-
-    def __matmul__(self, other: "BallMatrix") -> "BallMatrix":
-        """Return the product."""
-        with ctx.workprec(_BITS):
-            return BallMatrix(self.balls * other.balls)
-
-    def then(self, later: "BallMatrix") -> "BallMatrix":
-        """Return the product that applies this matrix first, and then a later one."""
-        return later @ self
-
-    def rows(self, numbers: slice) -> "BallMatrix":
-        """Return some of the rows."""
-        return BallMatrix(arb_mat(self.balls.tolist()[numbers]))
-
-    def interval(self) -> IntervalMatrix:
-        """Return the matrix in double precision, with its error."""
-        with ctx.workprec(_BITS):
-            pairs = [(float(ball.mid()), float(ball.rad().upper())) for ball in self.balls.entries()]
-        shape = self.balls.nrows(), self.balls.ncols(), 2
-        middle, errors = np.moveaxis(np.array(pairs).reshape(shape), -1, 0)
-        return IntervalMatrix(middle, np.abs(middle) * 2.0**-52 + errors * (1 + 1e-9) + 1e-290)
-
-
-def fixed(matrix: Matrix) -> BallMatrix:
-    """Return a matrix of finite doubles, exactly."""
-    return BallMatrix(arb_mat(matrix.tolist()))
-
-
-def stacked(*parts: BallMatrix) -> BallMatrix:
-    """Return matrices on top of each other."""
-    return BallMatrix(arb_mat([row for part in parts for row in part.balls.tolist()]))
-
-
-def exponential(generator: Matrix, dt: int, parts: int = 1) -> BallMatrix:
-    """Return e^{G dt}, with G per second.
-
-    Args:
-        generator: G, (n, n).
-        dt: in parts of a nanosecond.
-        parts: their number in a nanosecond.
+def enclosing(balls: arb_mat) -> IntervalMatrix:
+    """Return a matrix of balls in double precision, with its error.
 
     Raises:
         OverflowError: an entry, or its error, is beyond double precision.
     """
-    with ctx.workprec(_BITS):
-        found = (arb_mat(generator.tolist()) * arb(fmpq(dt, parts * NS_PER_S))).exp()
-        if not all(abs(entry).upper() < _LARGEST_DOUBLE for entry in found.entries()):
-            raise OverflowError
-        return BallMatrix(found)
+    if not all(abs(ball).upper() < _LARGEST_DOUBLE for ball in balls.entries()):
+        raise OverflowError
+    pairs = [(float(ball.mid()), float(ball.rad().upper())) for ball in balls.entries()]
+    middle, errors = np.moveaxis(np.array(pairs).reshape(balls.nrows(), balls.ncols(), 2), -1, 0)
+    return IntervalMatrix(middle, np.abs(middle) * 2.0**-52 + errors * (1 + 1e-9) + 1e-290)
+
+
+def inverse(matrix: Matrix) -> IntervalMatrix | None:
+    """Enclose the inverse of a matrix; None if that fails."""
+    try:
+        return enclosing(arb_mat(matrix.tolist()).inv())
+    except (ZeroDivisionError, OverflowError):
+        return None

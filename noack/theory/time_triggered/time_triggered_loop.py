@@ -13,13 +13,18 @@ Every T the sensor transmits x. The loop is that of the processes, with no step 
 import math
 from collections.abc import Callable
 from functools import cache, reduce
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
+from flint import arb_mat, ctx
 
+from noack.core.balls import identity, matrix, number, rows_of, stack
 from noack.core.linear_systems import Matrix, balancing_exponents
 from noack.proof.period_times import NEVER, LoopTimes
-from noack.theory.time_triggered.exact_matrices import IntervalMatrix, exponential, fixed, stacked
+from noack.theory.time_triggered.exact_matrices import IntervalMatrix, enclosing
+
+_BITS = 512
+"""Of a ball's midpoint: products of hundreds of steps lose far fewer."""
 
 
 class TimedMap(Protocol):
@@ -87,6 +92,15 @@ class Timeline(Generic[_Map]):
         return reduce(lambda first, later: first.then(later), [*parts, self._flow(end - now)])
 
 
+class _BallMap(NamedTuple):
+    """The map of a state, z to M z, as a matrix of balls."""
+
+    M: arb_mat
+
+    def then(self, later: "_BallMap") -> "_BallMap":
+        return _BallMap(later.M * self.M)
+
+
 class TimeTriggeredLoop:
     """The maps of a loop with the matrices A, (n, n), B, (n, m), K, (m, n), and H, (n, n)."""
 
@@ -98,23 +112,24 @@ class TimeTriggeredLoop:
         of_x, of_u = np.split(exponents[:, None], [n])
         A, H = np.ldexp(A, of_x - of_x.T), np.ldexp(H, of_x - of_x.T)
         B, K = np.ldexp(B, of_x - of_u.T), np.ldexp(K, of_u - of_x.T)
-        self.times, self._H = times, H
+        self.times, self._H = times, matrix(H.tolist())
         # The state of the loop is (x, x_c, u, w).
         size = 2 * (n + m)
         generator = np.zeros((size, size))
         generator[:n, :n], generator[n : 2 * n, n : 2 * n] = A, H
         generator[:n, 2 * n : 2 * n + m] = B
         x, x_c, u, w = np.split(np.eye(size), [n, 2 * n, 2 * n + m])
-        self._x, self._inputs, self._loop = slice(n), slice(2 * n, size), slice(size)
-        self._older = [slice(size + i * n, size + (i + 1) * n) for i in range(times.behind)]
+        self._x, self._inputs, self._loop = range(n), range(2 * n, size), range(size)
+        self._older = [range(size + i * n, size + (i + 1) * n) for i in range(times.behind)]
         """x of the transmissions before, the newest one first."""
         without_update = w if times.holds_input else 0 * w
         occurrences = [(x, x_c, w, w), (x, x_c, u, K @ x_c), (x, x_c, u, without_update)]
-        self._start = fixed(np.eye(size + n * times.behind))
+        self._start = identity(size + n * times.behind)
+        flow = matrix(generator.tolist())
         self._between = Timeline(
             times,
-            lambda dt: exponential(generator, dt, times.parts),
-            *(fixed(np.vstack(rows)) for rows in occurrences),
+            lambda dt: _BallMap((number(times.exact_seconds(dt)) * flow).exp()),
+            *(_BallMap(matrix(np.vstack(rows).tolist())) for rows in occurrences),
         ).between
 
     def period(self, slot: int, is_delivered: bool) -> IntervalMatrix:
@@ -130,12 +145,16 @@ class TimeTriggeredLoop:
         Raises:
             OverflowError: an entry is beyond double precision.
         """
-        begin, state = slot * self.times.period, self._start
-        end, sent = begin + self.times.period, [state.rows(part) for part in (self._x, *self._older)]
-        loop, arrival = state.rows(self._loop), begin
+        with ctx.workprec(_BITS):
+            return enclosing(self._period(slot, is_delivered))
+
+    def _period(self, slot: int, is_delivered: bool) -> arb_mat:
+        begin, state, times = slot * self.times.period, self._start, self.times
+        end, sent = begin + times.period, [rows_of(state, part) for part in (self._x, *self._older)]
+        loop, arrival = rows_of(state, self._loop), begin
         if is_delivered:
-            arrival += self.times.delay
-            loop = self._between(begin, arrival) @ loop
-            updated = exponential(self._H, self.times.whole_delay, self.times.parts) @ sent[-1]
-            loop = stacked(loop.rows(self._x), updated, loop.rows(self._inputs))
-        return stacked(self._between(arrival, end) @ loop, *sent[:-1]).interval()
+            arrival += times.delay
+            loop = self._between(begin, arrival).M * loop
+            updated = (number(times.exact_seconds(times.whole_delay)) * self._H).exp() * sent[-1]
+            loop = stack([rows_of(loop, self._x), updated, rows_of(loop, self._inputs)])
+        return stack([self._between(arrival, end).M * loop, *sent[:-1]])
