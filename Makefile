@@ -24,7 +24,7 @@ LIVE ?=
 SETTABLE := PYTHON VENV CC SCENARIO CAMPAIGN SETTLING SESSION RUNS MINUTES N ARGS LIVE
 UNKNOWN := $(foreach v,$(filter-out $(SETTABLE) SHELL MAKE% -%,$(.VARIABLES)),$(if $(filter command,$(origin $v)),$v))
 $(if $(strip $(UNKNOWN)),$(error no such variable: $(strip $(UNKNOWN)); there are $(SETTABLE)))
-C_FILES := $(wildcard native/*.[ch] native/*/*.[ch] extensions/*/*/*.c)
+C_FILES := $(wildcard native/*/*.[ch] extensions/*/*/*.c)
 EXTENSIONS := $(patsubst %/pyproject.toml,%,$(wildcard extensions/*/pyproject.toml))
 GIVEN_DRAWS := $(strip $(if $(filter file,$(origin N)),,--number $(N)) $(if $(filter file,$(origin MINUTES)),,--minutes $(MINUTES)))
 override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
@@ -199,17 +199,15 @@ dist: setup-dev ## Build the sdists, and from them the wheels, into dist/
 	@$(SAY) "installing the compiler for all platforms" $(PIP) -r requirements-compiler.lock
 	@$(SAY) "building noack's sdist" $(BIN)/uv build --quiet --sdist --no-build-isolation --out-dir dist .
 	@$(SAY) "building noack-netem's sdist" $(BIN)/uv build --quiet --sdist --no-build-isolation --out-dir dist netem
-	@$(SAY) "building noack's wheel" $(BIN)/uv build --quiet --wheel --no-build-isolation --out-dir dist dist/noack-*.tar.gz
 	@set -- $$($(BIN)/python native/build.py --platforms); number=0; \
-	for platform; do number=$$((number + 1)); \
-		NOACK_PLATFORM=$$platform $(SAY) "building noack-netem's wheel $$number of $$#, for $$platform" \
-			$(BIN)/uv build --quiet --wheel --no-build-isolation --out-dir dist \
-			dist/noack_netem-*.tar.gz || exit; done
+	for platform; do number=$$((number + 1)); for sdist in dist/*.tar.gz; do \
+		NOACK_PLATFORM=$$platform $(SAY) "building a wheel of $$sdist, $$number of $$#, for $$platform" \
+			$(BIN)/uv build --quiet --wheel --no-build-isolation --out-dir dist $$sdist || exit; done; done
 	@ls -s --block-size=K dist/*
 
 clean: ## Remove the environment and caches, not runs/
 	rm -rf $(VENV) site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache \
-		netem/core/libnoack.so netem/core/_core_header.py
+		{netem/core/libnetem,noack/core/libnoack}.so {netem,noack}/core/_core_header.py
 
 $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "noack needs Python >= 3.11; none found (set PYTHON=...)" >&2; exit 2; }
@@ -226,7 +224,7 @@ endef
 $(VENV)/.dependencies: requirements.lock | $(VENV)/bin/python
 	@# On another core meanwhile the library in C; the target core reports what fails of it.
 	@# pip would compile the modules on one core. Nobody runs the packages' own tests.
-	@{ $(call BUILD_CORE,--library); } 2> /dev/null & \
+	@{ $(call BUILD_CORE,--library-alone); } 2> /dev/null & \
 		$(SAY) "installing pinned dependencies" $(PIP) --no-compile -r requirements.lock && \
 		{ $(SAY) "compiling their modules" $(BIN)/python -m compileall -q -q -j 0 -x '/tests/' $(VENV)/lib || true; }; \
 		status=$$?; wait; exit $$status

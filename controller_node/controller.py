@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.core.clock import NEVER_NS, NS_PER_S
-from netem.core.core_library import CData, core, reals_at
+from netem.core.core_library import CData, reals_at
 from netem.core.periods import Period
 from netem.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.controllers.controller_settings import ControlFailedError, ControlLaw, ControlModel
 from noack.controllers.linear_feedback import LinearFeedback
+from noack.core.core_library import core
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.references import Reference, ReferenceInForce
 from noack.machines.loop_machines import (

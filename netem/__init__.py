@@ -6,7 +6,6 @@ It imports nothing of noack. From the bottom up:
 * ``guarantee``, ``traces``: the rules of the guarantee; traces of packets and captures;
 * ``impairments``: a file per loss model, delay, discipline, …; predictions;
 * ``link_state.py`` prepares a link for the core, which decides the outcome of each packet;
-  ``channel.py`` is a network without sockets;
 * ``relay``: the core relays datagrams between sockets; the class ``relay.Relay`` does so for
   ``stand_alone.py``, a program, for ``lossy_udp.py`` in tests, and for ``shell`` around a command;
 * ``control``: statistics and live changes.

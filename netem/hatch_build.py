@@ -1,6 +1,7 @@
 """Builds the library in C for wheels and editable installations; hatchling calls it (pyproject.toml).
 
-``native/`` is beside this folder in the repository, and in it in a source distribution.
+noack-netem and noack have this file, each with its library and the folder for it (``self.config``).
+``native/`` is in the folder that is built, but beside this one for noack-netem in the repository.
 """
 
 import os
@@ -37,15 +38,16 @@ class CoreHook(BuildHookInterface[Any]):
         """
         build = self._build()
         tag = os.environ.get("NOACK_PLATFORM")
-        folder = Path(tempfile.mkdtemp(prefix="noack-core-")) if tag else Path(self.root) / "core"
+        library, place = build["LIBRARIES"][self.config["library"]], self.config["folder"]
+        folder = Path(tempfile.mkdtemp(prefix="noack-core-")) if tag else Path(self.root) / place
         if tag is None:
-            build["build"](folder)
-            tag = _platform((folder / build["LIBRARY"]).read_bytes())
+            build["build"](library, folder)
+            tag = _platform((folder / library.file).read_bytes())
         else:
-            build["build"](folder, target=tag)
+            build["build"](library, folder, target=tag)
             self._scratch = folder
-        for name in (build["LIBRARY"], build["HEADER"]):
-            build_data["force_include"][str(folder / name)] = f"core/{name}"
+        for name in (library.file, build["HEADER"]):
+            build_data["force_include"][str(folder / name)] = f"{place}/{name}"
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{tag}"
 

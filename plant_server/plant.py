@@ -27,9 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.core.clock import NEVER_NS, NS_PER_S
-from netem.core.core_library import CData, core, reals_at
+from netem.core.core_library import CData, reals_at
 from netem.core.periods import ANY_PERIOD, Period
 from netem.core.random_streams import normals, uniforms
+from noack.core.core_library import core
 from noack.core.linear_systems import Matrix, Vector, discretise, product, transition
 from noack.disturbances.disturbance_settings import Place, SignalSource
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, TransitionMatrices, parts_of

@@ -20,8 +20,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from netem.core.core_library import CData, core, ffi, new_handle, new_structure, reals_at
+from netem.core.core_library import CData, reals_at
 from netem.core.periods import Period
+from noack.core.core_library import core, ffi, new_handle, new_structure
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.references import Reference, ReferenceInForce
 from noack.machines.loop_machines import (

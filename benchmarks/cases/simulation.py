@@ -25,8 +25,8 @@ from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.random_draws import box_of
 from netem.core.clock import NS_PER_S
-from netem.core.core_library import core, ffi
 from netem.core.realtime_settings import realtime
+from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Vector
 from noack.proof.elaborate.scenario import read_loop
 from noack.protocol.record_tables import PLANT_STEP

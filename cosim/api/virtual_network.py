@@ -1,6 +1,6 @@
 """The network of a scenario for programs that have a loop of their own, in virtual time.
 
-It is the channel of a simulated run (:mod:`netem.channel`): the core decides for each packet, by the
+It is the channel of a simulated run (:mod:`noack.machines.channel`): the core decides for each packet, by the
 rules, random streams and guarantee of the emulator.
 """
 
@@ -10,13 +10,13 @@ from typing import Generic, NamedTuple, TypeVar
 
 from cosim.api.scenarios import Source, load
 from cosim.shipped_files import find_shipped
-from netem.channel import Channel, Departure
 from netem.core import toml_file
 from netem.core.errors import CallerError
 from netem.core.number_checks import one_of, whole_number
 from netem.core.packet_rows import NETEM_PACKET
 from netem.core.settings_section import LARGEST_SEED, ReadTable
 from netem.link_state import LinkState
+from noack.machines.channel import Channel, Departure
 from noack.machines.run_channel import link_name, require_stand_alone
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.scenario.scenario import Scenario

@@ -36,10 +36,10 @@ from cosim.simulation.exact_simulation import (
     vanished_error,
     vanishes_s,
 )
-from netem.core.core_library import core
 from netem.core.errors import CallerError, ExitStatus
 from netem.core.packet_rows import Fate
 from netem.link_state import LinkState
+from noack.core.core_library import core
 from noack.core.linear_systems import Matrix, Vector
 from noack.machines.run_channel import UPDATE_LINK
 from noack.scenario.resolution import LoopMatrices, loop_of, rule_of

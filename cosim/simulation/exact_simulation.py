@@ -14,13 +14,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.core.core_library import CData, core, dtype_of, ffi, new_handle, new_structure, pointer_to
+from netem.core.core_library import CData
 from netem.core.errors import CallerError
 from netem.core.random_streams import stream_keys
 from netem.impairments.kinds.corrupt import Corrupt
 from netem.impairments.kinds.loss import LossOf
 from netem.impairments.link_settings import LinkSettings
 from netem.link_state import LinkState, stream_names
+from noack.core.core_library import core, dtype_of, ffi, new_handle, new_structure, pointer_to
 from noack.core.linear_systems import Matrix, Vector
 from noack.machines.run_channel import UPDATE_LINK
 from noack.scenario.resolution import loop_of, rule_of

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from netem.core.core_library import core, ffi, new_handle, pointer_to, set_fields
+from netem.core.core_library import set_fields
 from netem.core.errors import CallerError
+from noack.core.core_library import core, ffi, new_handle, pointer_to
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import loop_of, rule_of

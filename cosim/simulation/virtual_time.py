@@ -27,11 +27,12 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from cosim.record.run_scenario import write_scenario
 from netem.core.clock import NEVER_NS, NS_PER_S
-from netem.core.core_library import CData, core, ffi, new_handle
+from netem.core.core_library import CData
 from netem.core.errors import ExitStatus, MachineError, why
 from netem.core.file_access import remove_folder
 from netem.core.settings_section import ReadTable
 from netem.core.system_processes import require_limits
+from noack.core.core_library import core, ffi, new_handle
 from noack.core.progress import Progress, no_progress
 from noack.machines.loop_machines import LoopMachines, row_types
 from noack.machines.run_channel import RUN_ID, UserNetwork, channel_of

@@ -17,16 +17,6 @@ enum {
     EARLY_NS = 1000      /* a timer may expire so much before its time */
 };
 
-int64_t clock_ns(int clock) {
-    struct timespec now;
-    clock_gettime(clock, &now);
-    return (int64_t)now.tv_sec * NS_PER_S + now.tv_nsec;
-}
-
-int64_t run_time_ns(const noack_clock *clock) {
-    return noack_clock_at_ns(clock, clock_ns(CLOCK_MONOTONIC));
-}
-
 noack_driver *noack_driver_new(
     noack_process *process, const noack_wire *wire, int64_t spin_ns, int64_t coalescing_ns,
     const char **wrong) {
@@ -94,7 +84,7 @@ static int64_t reason_of(int64_t question) {
 static void fetch_machine_of(const noack_driver *driver, int64_t place) {
     const arrival *next = &scratch_of(driver)->arrivals[place];
     if (place < scratch_of(driver)->in_end)
-        fetch_machine(driver->process, max_of(noack_wire_loop(next->data, next->size_bytes), 0));
+        fetch_machine(driver->process, max_of(header_loop(next->data, next->size_bytes), 0));
 }
 
 /* Examine the current datagram; return NOACK_DRIVER_OPEN if it must be opened. */
@@ -103,10 +93,10 @@ static int64_t examine(noack_driver *driver) {
     const arrival *current = &scratch->arrivals[scratch->in_next];
     uint8_t *datagram = current->data;
     int64_t size_bytes = current->size_bytes;
-    int64_t loop = noack_wire_loop(datagram, size_bytes);
+    int64_t loop = header_loop(datagram, size_bytes);
     fetch_machine_of(driver, scratch->in_next + 1);
     int is_answer = driver->sources[1].name_bytes > 0
-                    && noack_wire_flow(datagram, size_bytes) == NOACK_ACKNOWLEDGEMENT;
+                    && header_flow(datagram, size_bytes) == NOACK_ACKNOWLEDGEMENT;
     if (loop >= driver->process->loops) /* rejected by the first loop */
         loop = 0;
     noack_machine *machine = noack_process_machine(driver->process, max_of(loop, 0));

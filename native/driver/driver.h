@@ -3,7 +3,7 @@
 #define NOACK_DRIVER_H
 
 #define _GNU_SOURCE
-#include "../core.h"
+#include "channel.h"
 
 #include <netinet/in.h>
 #include <sys/socket.h>

@@ -6,7 +6,7 @@
 
 typedef uint64_t word __attribute__((vector_size(FOUR * 8)));
 #define OF_ALL(number) ((word){number, number, number, number})
-#include "../blake2b.h"
+#include "../loop/blake2b.h"
 
 void tag_four(
     const noack_wire *wire, int64_t content_bytes, uint8_t *const datagrams[FOUR],

@@ -12,11 +12,6 @@ enum noack_driver_reason {
     NOACK_DRIVER_NOTHING   /* within the driver only */
 };
 
-enum {
-    NOACK_NAME_BYTES = 40, /* room for a socket address (IPv6: 28 bytes), or a 5-tuple */
-    NOACK_ERRNOS = 256
-};
-
 /* What Python found of an encrypted datagram. */
 enum noack_opened { NOACK_NOT_OPENED, NOACK_OPENED, NOACK_NOT_AUTHENTIC };
 
@@ -79,6 +74,71 @@ void noack_driver_add_datagram(
 /* Let woken processes run before the calling thread, whose time slice becomes 100 ms, where Linux
    has time slices of threads (since 6.12). */
 void noack_prefer_others(void);
+
+/* ---- The network of a run, without sockets --------------------------------------------------- */
+
+/* A datagram in the network. */
+typedef struct {
+    int64_t flow;                   /* its direction times loops, and its loop */
+    int64_t size_bytes;
+    int64_t arrival_ns;             /* at the socket; later than its handling: unknown */
+    int64_t bit;                    /* the bit that the network has flipped; -1: none */
+    uint8_t head[NOACK_HEAD_BYTES]; /* its first bytes */
+    noack_message message;          /* what it carries, in a simulation */
+} noack_datagram;
+
+/* A question of a channel besides NOACK_ASK_CHANGE and NOACK_ROWS_FULL. */
+enum noack_channel_question {
+    NOACK_ASK_OUTCOME = 16 /* the user's network: set outcome_ns for the datagram in asked */
+};
+
+/* Memory of delayed datagrams: native/driver/channel.c. */
+typedef struct noack_delayed noack_delayed;
+
+/* The network of a run in both directions; each flow has the row of its loop. */
+typedef struct {
+    int64_t loops;
+    int64_t directions;          /* 1 or 2 */
+    noack_link *links[2];        /* from the sensors; from the controllers */
+    int64_t is_scripted;         /* 1: Python decides for what comes from the sensors */
+    int64_t inputs;              /* number of the next input */
+    int64_t reached_ns;          /* arrival of the last datagram; -1: none */
+    /* time from which the first link has other settings; INT64_MAX: none */
+    int64_t change_ns;
+    int64_t answered;            /* 1: Python has decided for this datagram */
+    int64_t outcome_ns;          /* its time from arrival to departure; -1: it is lost */
+    noack_datagram asked;
+    int64_t asked_ns;
+    int64_t delayed_count;       /* datagrams that have been delayed so far */
+    /* free_place: -1: none */
+    int64_t heap_count, places, free_place;
+    noack_heap_entry *heap;      /* (places,) */
+    noack_delayed *delayed;      /* (places,) */
+    noack_waiting *waiting;      /* (places,) */
+    int64_t packet_count, release_count;
+    noack_packet_row *packets;   /* (packet_count,) */
+    noack_release_row *releases; /* (release_count,) */
+    int64_t leaving_count;       /* of the last input: what leaves at once */
+    noack_datagram leaving[2];
+} noack_channel;
+
+/* Return a channel; its links, (directions,), must outlive it. */
+noack_channel *noack_channel_new(
+    int64_t loops, int64_t directions, noack_link *const *links, int64_t is_scripted,
+    const char **wrong);
+void noack_channel_free(noack_channel *channel);
+
+/* Time of the next departure; INT64_MAX: nothing is delayed. */
+int64_t noack_channel_due_ns(const noack_channel *channel);
+
+/* A datagram arrives, or what is due leaves; see leaving. Return NOACK_DONE, or a question: after
+   the answer the call is repeated. The datagram's flow is one of the channel. */
+int64_t noack_channel_handle(
+    noack_channel *channel, const noack_datagram *datagram, int64_t now_ns);
+int64_t noack_channel_release(noack_channel *channel, int64_t now_ns);
+
+/* Last departure time of each flow of a direction, (loops,); the caller fills it with -1. */
+void noack_channel_latest(noack_channel *channel, int64_t direction, int64_t *latest_ns);
 
 /* ---- Simulation in virtual time -------------------------------------------------------------- */
 

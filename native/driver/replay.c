@@ -4,7 +4,7 @@
    No output depends on the exact value of now_ns. So it is only checked that it is not before a
    deadline, and does not decrease. After a difference the replay goes on: what the machine sends is
    compared with what its receivers recorded. */
-#include "../loop/loop.h"
+#include "channel.h"
 
 enum { TABLES = 4, SEQUENCE = 8, TIME = 16, NOW = 24, SENT_HEADER = 3, SENT_DATAGRAM = 5 };
 enum { PACKET_FLOW = 32, PACKET_SIZE = 80, PACKET_HEAD = 88, MOST_BYTES = 65535 };

@@ -7,7 +7,7 @@
    ticks, until step k + 1. Nothing is late, and every delivered update takes the same time. */
 #include <math.h>
 
-#include "../loop/loop.h"
+#include "channel.h"
 
 static const double DIVERGED_NORM = 1e100; /* a state above this norm counts as diverged */
 enum { LAST_STEP = 1 << 30 };

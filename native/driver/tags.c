@@ -4,6 +4,8 @@
 
 #include <string.h>
 
+#include "../exact/exact.h"
+
 static int can_tag_four(int64_t content_bytes) {
     return noack_exact_instructions() > 0 && content_bytes % 8 == 0
            && is_between(NOACK_HEADER_BYTES, content_bytes, MOST_TAGGED_BYTES);

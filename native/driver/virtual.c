@@ -7,7 +7,7 @@
    the record shows is written, unless the network has flipped a bit of it. */
 #include <stdlib.h>
 
-#include "../core.h"
+#include "channel.h"
 
 enum { FIRST_PLACES = 256, MOST_OUTPUTS = 2 };
 
@@ -122,7 +122,7 @@ static void forward(noack_simulation *simulation) {
 
 /* Inputs of the machines. ---------------------------------------------------------------------- */
 
-static int64_t ask(noack_simulation *simulation, int64_t who, int64_t question) {
+static int64_t asks(noack_simulation *simulation, int64_t who, int64_t question) {
     simulation->asking = who;
     return question;
 }
@@ -131,7 +131,7 @@ static int64_t tick(noack_simulation *simulation, int64_t role) {
     noack_process *process = simulation->processes[role];
     int64_t question = noack_process_tick(process, simulation->now_ns);
     if (question != NOACK_DONE)
-        return ask(simulation, role, question);
+        return asks(simulation, role, question);
     send(simulation, &process->output);
     return NOACK_DONE;
 }
@@ -139,7 +139,7 @@ static int64_t tick(noack_simulation *simulation, int64_t role) {
 static int64_t release(noack_simulation *simulation) {
     int64_t question = noack_channel_release(simulation->channel, simulation->now_ns);
     if (question != NOACK_DONE)
-        return ask(simulation, NOACK_NETWORK, question);
+        return asks(simulation, NOACK_NETWORK, question);
     forward(simulation);
     return NOACK_DONE;
 }
@@ -147,7 +147,7 @@ static int64_t release(noack_simulation *simulation) {
 static int64_t cross(noack_simulation *simulation, const noack_datagram *datagram) {
     int64_t question = noack_channel_handle(simulation->channel, datagram, simulation->now_ns);
     if (question != NOACK_DONE)
-        return ask(simulation, NOACK_NETWORK, question);
+        return asks(simulation, NOACK_NETWORK, question);
     remove_first(simulation);
     forward(simulation);
     return NOACK_DONE;
@@ -166,7 +166,7 @@ static void examine_flipped(
     noack_message message;
     int64_t size_bytes = noack_wire_encode(&simulation->wire, &datagram->message, data);
     data[datagram->bit / 8] ^= (uint8_t)(1 << (datagram->bit % 8));
-    int64_t loop = noack_wire_loop(data, size_bytes);
+    int64_t loop = header_loop(data, size_bytes);
     loop = loop < simulation->channel->loops ? loop
                                              : 0; /* its receiver rejects a datagram of no loop */
     noack_reception *reception = reception_of(simulation, role, datagram->message.flow, loop);
@@ -191,7 +191,7 @@ static int64_t receive(noack_simulation *simulation, int64_t role, noack_datagra
     if (examination == NOACK_ACCEPTED) {
         int64_t question = noack_process_handle(process, message, simulation->now_ns);
         if (question != NOACK_DONE)
-            return ask(simulation, role, question);
+            return asks(simulation, role, question);
     }
     noack_wire_count(reception, examination, message);
     remove_first(simulation);

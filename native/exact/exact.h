@@ -5,7 +5,11 @@
 #include <math.h>
 #include <string.h>
 
-#include "../core.h"
+#include "../loop/loop.h"
+
+#pragma GCC visibility push(default)
+#include "public.h"
+#pragma GCC visibility pop
 
 enum {
     HIGHEST = 24,        /* largest degree of a state's Taylor polynomial */

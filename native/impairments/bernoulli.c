@@ -1,5 +1,5 @@
 /* Bernoulli losses: each packet is lost with a probability, independently unless correlated. */
-#include "../core.h"
+#include "../network/network.h"
 
 void apply_bernoulli(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     const noack_chance *chance = &stage->chance;

@@ -1,5 +1,5 @@
 /* Blackouts: intervals of time in which all packets are lost. */
-#include "../core.h"
+#include "../network/network.h"
 
 void apply_blackout(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;

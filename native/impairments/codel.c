@@ -16,7 +16,7 @@
    change: it drops the next packet that need not pass. */
 #include <math.h>
 
-#include "../core.h"
+#include "../network/network.h"
 
 /* The time at which the service of a newly arrived packet would begin: with a burst, the time from
    which the rate fills the bucket for it, or its arrival. */

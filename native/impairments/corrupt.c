@@ -1,5 +1,5 @@
 /* Corruption: one bit of the payload is flipped. */
-#include "../core.h"
+#include "../network/network.h"
 
 /* Draw whether a bit is flipped; not of an empty payload. */
 void apply_corrupt(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {

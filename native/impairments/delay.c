@@ -5,7 +5,7 @@
    values. */
 #include <math.h>
 
-#include "../core.h"
+#include "../network/network.h"
 
 /* sqrt(3/4): the Pareto distribution with shape 3 and scale 1 has mean 3/2 and variance 3/4. */
 static const double PARETO_MEAN = 1.5, PARETO_DEVIATION = 0.8660254037844386;

@@ -2,7 +2,7 @@
 
    If two copies are on their way already, there is no third one. If the first was lost, the copy of
    the second takes its place. */
-#include "../core.h"
+#include "../network/network.h"
 
 void apply_duplicate(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     double uniform[2];

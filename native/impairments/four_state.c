@@ -2,7 +2,7 @@
 
    1: gap, delivered. 2: delivered within a burst. 3: lost within a burst. 4: a single loss within a
    gap. It starts in state 1 and advances before each packet. From state 4 it returns to 1. */
-#include "../core.h"
+#include "../network/network.h"
 
 void apply_four_state(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     const noack_four_state *settings = &stage->four_state;

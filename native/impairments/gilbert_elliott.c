@@ -1,6 +1,6 @@
 /* Bursty losses: a two-state Markov chain (Gilbert, 1960; Elliott, 1963), of each flow or, with a
    step, of the link. */
-#include "../core.h"
+#include "../network/network.h"
 
 enum { GOOD, BAD };
 

@@ -9,7 +9,7 @@
    The times of all departures are known on arrival, as those of a bottleneck are (tail_drop.c). The
    queue's ring has the time at which an opportunity begins to carry a packet, instead of that at
    which it leaves. */
-#include "../core.h"
+#include "../network/network.h"
 
 enum { OPPORTUNITY_BYTES = NOACK_OPPORTUNITY_BYTES, NS_PER_MS = 1000000 };
 

@@ -1,5 +1,5 @@
 /* Periodic losses, according to the packet's number in its flow. */
-#include "../core.h"
+#include "../network/network.h"
 
 void apply_periodic(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;

@@ -1,6 +1,6 @@
 /* Priorities: whenever the link is free, it sends the waiting packet of the flow with the smallest
    number; flows with the same number in order of arrival. */
-#include "../core.h"
+#include "../network/network.h"
 
 void apply_priority(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;

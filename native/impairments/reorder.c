@@ -2,7 +2,7 @@
    at once gap - 1 are delayed; then each packet is a candidate until a draw succeeds. So with
    probability P a share 1/(gap - 1 + 1/P) leaves at once, for every correlation: it is that of the
    candidates' draws. */
-#include "../core.h"
+#include "../network/network.h"
 
 void apply_reorder(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     double uniform[2];

@@ -4,7 +4,7 @@
    that was sent before it. Its receiving time is interpolated between those of the two records
    around it, so that a network that keeps the order of the recorded packets keeps the order of all
    packets. */
-#include "../core.h"
+#include "../network/network.h"
 
 /* change * elapsed / gap for 0 <= elapsed < gap; it ascends with elapsed + result. Whole numbers,
    without overflow: of gaps beyond 2 s, some low bits are ignored. */

@@ -9,7 +9,7 @@
    The slots of a flow do not depend on other flows. Hence the time until which they are taken is
    all that is remembered, and a departure is known on arrival. Own slots are counted over all
    rounds. The flows are rows of the link: the loops of a run, or the clients of a relay. */
-#include "../core.h"
+#include "../network/network.h"
 
 /* The own slots of a flow: their numbers in a round, ascending. */
 typedef struct {

@@ -1,5 +1,5 @@
 /* Losses given by a list of packet numbers within a flow. */
-#include "../core.h"
+#include "../network/network.h"
 
 void apply_scripted(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;

@@ -14,7 +14,7 @@
 
    The ring of a queue has two numbers for each packet, at its place and at the place behind it:
    when it leaves, and how many bytes were put into the queue before it. */
-#include "../core.h"
+#include "../network/network.h"
 
 /* What a packet occupies on the line. */
 int64_t line_bytes_of(const noack_bottleneck *settings, int64_t size_bytes) {

@@ -4,10 +4,16 @@
 
 #include <string.h>
 
-#include "../core.h"
+#include "../network/network.h"
+
+#pragma GCC visibility push(default)
+#include "public.h"
+#pragma GCC visibility pop
+
+enum { MOST_LOOPS = 65535 }; /* of a run: datagrams have the number of the loop in 16 bits */
 
 #define NO_TICK INT64_MAX
-#define MESSAGE_TIMES_NS (INT64_C(1) << 62) /* times of messages are below; see native/wire.c */
+#define MESSAGE_TIMES_NS (INT64_C(1) << 62) /* times of messages are below; see wire.c */
 
 static inline void copy(int64_t count, const double *source, double *result) {
     memcpy(result, source, (size_t)count * sizeof *result);
@@ -139,5 +145,25 @@ void noack_disturb(noack_plant *plant, int64_t step);
 /* observer.c: advance x-hat to a measurement [y; u of the plant's steps since the last one]. */
 void noack_observe(
     noack_observer *observer, const noack_message *message, const noack_period *plant_period);
+
+/* process.c: let the processor fetch the memory of a machine, which is needed soon. Without it
+   the step of one of a thousand loops waits for it. */
+void fetch_machine(const noack_process *process, int64_t loop);
+
+/* Copy what a message has: it may have few entries. */
+static inline void copy_message(noack_message *to, const noack_message *from) {
+    memcpy(to, from, offsetof(noack_message, vector) + (size_t)from->entries * sizeof(double));
+}
+
+/* wire.c: a message's datagram without its tag, of which the size is returned; its tag;
+   and whether bytes that were received are a tag. */
+int64_t write_content(const noack_wire *wire, const noack_message *message, uint8_t *datagram);
+void write_tag(const noack_wire *wire, int64_t content_bytes, uint8_t *datagram);
+int is_tag(const uint64_t tag[NOACK_TAG_BYTES / 8], const uint8_t *bytes);
+
+/* wire.c: the header of a message's datagram; and the tests of an authentic datagram. */
+void noack_wire_header(const noack_wire *wire, const noack_message *message, uint8_t *header);
+int64_t noack_wire_examine_message(
+    const noack_reception *reception, int64_t from_peer, const noack_message *message);
 
 #endif

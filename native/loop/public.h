@@ -5,6 +5,24 @@
    handle points to must live longer: transitions, reference, rule and observer than a machine, the
    machines than their process. */
 
+/* ---- Arithmetic in a fixed order: the same bits on every processor --------------------------- */
+
+/* result = M v; M is (rows, columns). The result must not overlap v. */
+void noack_product(
+    int64_t rows, int64_t columns, const double *matrix, const double *vector, double *result);
+
+/* Each of `count` states, (count, n), becomes M^j times it, with its own j < 2^bits of `steps`,
+   whose bits are followed from the lowest one. powers: M^(2^b), (bits, n, n); scratch: (n). */
+void noack_advance_by_periods(
+    int64_t n, int64_t bits, const double *powers, int64_t count, const int64_t *steps,
+    double *states, double *scratch);
+
+/* The Euclidean norm of a vector, without overflow of squares. */
+double noack_norm(int64_t count, const double *vector);
+
+/* result = e^M, (n, n); scratch: (10, n, n). See native/loop/exponential.c. */
+void noack_exponential(int64_t n, const double *matrix, double *result, double *scratch);
+
 /* ---- A trigger rule, and its condition since the last event ---------------------------------- */
 
 /* A trigger rule, as noack.trigger_policies.trigger_rule has it. With z = (x, e_s), the sensor transmits as
@@ -57,14 +75,6 @@ enum {
 };
 
 enum noack_sequence { NOACK_NO_SEQUENCE = -1 };
-
-/* What a message is, as noack.protocol.wire_format.Flow. */
-enum noack_message_kind {
-    NOACK_MEASUREMENT = 1,
-    NOACK_UPDATE,
-    NOACK_ACTUATION,
-    NOACK_ACKNOWLEDGEMENT
-};
 
 /* What a step has come to; and what a machine asks Python for before its step goes on. */
 enum noack_question {
@@ -457,7 +467,6 @@ void noack_observer_correct(noack_observer *observer, const double *y);
 /* ---- The wire format (docs/wire.md) ---------------------------------------------------------- */
 
 enum {
-    NOACK_HEADER_BYTES = 32,
     NOACK_TAG_BYTES = 16,
     NOACK_KEY_BYTES = 32,
     NOACK_DATAGRAM_BYTES = NOACK_HEADER_BYTES + 8 * NOACK_MAX_ENTRIES + NOACK_TAG_BYTES
@@ -492,13 +501,6 @@ void noack_wire_key(noack_wire *wire, const uint8_t key[NOACK_KEY_BYTES]);
 /* Write the datagram of a message of at most NOACK_MAX_ENTRIES entries; return its size in bytes.
    If it is to be encrypted, its vector is still readable, and its tag missing. */
 int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, uint8_t *datagram);
-
-/* The number in a header, not verified; -1: the datagram is too short. */
-int64_t noack_wire_loop(const uint8_t *datagram, int64_t size_bytes);
-int64_t noack_wire_flow(const uint8_t *datagram, int64_t size_bytes);
-
-/* The error level in the header of an update, not verified; 0: there is none. */
-int64_t noack_wire_error_level(const uint8_t *datagram, int64_t size_bytes);
 
 /* Examine a datagram that may be one of a loop; return a noack_examination. opened: 1 if Python has
    decrypted its vector in place. The message is complete if the datagram is accepted. */

@@ -2,7 +2,7 @@
    departures. */
 #include <string.h>
 
-#include "../core.h"
+#include "network.h"
 
 noack_packet_row packet_row(
     const noack_decision *decision, int64_t input, int64_t arrival_ns, int64_t flow,

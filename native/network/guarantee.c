@@ -17,7 +17,7 @@
 
    S(i) is the number of losses among a flow's packets with numbers below i. Windows and recovery
    are differences of S, which a ring stores per flow. */
-#include "../core.h"
+#include "network.h"
 
 /* Whether the guarantee needs S. */
 int counts_losses(const noack_link *link) { return link->window_count > 0 || link->recovery > 0; }

@@ -6,7 +6,7 @@
    apply. */
 #include <string.h>
 
-#include "../core.h"
+#include "network.h"
 
 static int is_bottleneck(const noack_stage *stage) {
     return stage->kind == NOACK_CODEL || stage->kind == NOACK_TAIL_DROP || is_scheduler(stage);

@@ -1,7 +1,7 @@
 /* Makes a link of settings, which it checks and copies: the other files assume what is checked. */
 #include <stdlib.h>
 
-#include "../core.h"
+#include "network.h"
 
 /* With these limits no sum and no product of the other files overflows, for packets of at most
    65,535 bytes that arrive at times from 0 to FAR_NS. */

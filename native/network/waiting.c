@@ -18,7 +18,7 @@
    of the flow). So no packet is ever stale, whatever the other stages do: the losses are those that
    are decided at the arrivals, which noack_must_pass allows, and no packet needs to be held back
    for others. */
-#include "../core.h"
+#include "network.h"
 
 static int is_before(const noack_waiting *a, const noack_waiting *b) {
     return a->key < b->key || (a->key == b->key && a->order < b->order);

@@ -182,7 +182,7 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
 
 /* The row of the datagram's loop; count a datagram of no loop as refused. */
 static int64_t row_of_loop(noack_relay *relay, const uint8_t *data, int64_t size_bytes) {
-    int64_t loop = noack_wire_loop(data, size_bytes);
+    int64_t loop = header_loop(data, size_bytes);
     if (0 <= loop && loop < relay->loops)
         return loop;
     relay->no_loop++;
@@ -287,7 +287,7 @@ static void decide(noack_relay *relay, int64_t direction, int64_t row, int64_t s
     client->last_ns = relay->now_ns;
     serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
     if (!relay->devices && link->scheduler >= 0)
-        link->flows[client->flow_row].error_level = noack_wire_error_level(data, size_bytes);
+        link->flows[client->flow_row].error_level = header_error_level(data, size_bytes);
     noack_link_decide(
         link, client->flow_row, max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns,
         &decision);

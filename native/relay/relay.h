@@ -6,7 +6,11 @@
 #include <sys/epoll.h>
 #include <sys/socket.h>
 
-#include "../core.h"
+#include "../network/network.h"
+
+#pragma GCC visibility push(default)
+#include "public.h"
+#pragma GCC visibility pop
 
 enum {
     BUFFERS = 128,                    /* datagrams received at once */

@@ -1,6 +1,7 @@
-"""The core in C (native/): its functions, its handles, and numpy's row types of its structures.
+"""The network's library in C (native/): its functions, its handles, and numpy's row types of its structures.
 
-The library is built ahead of time, by ``make setup`` or with the wheel. Nothing is compiled here.
+The library is built ahead of time, by ``make setup`` or with the wheel. Nothing is compiled here. The
+loop has a library of its own, :mod:`noack.core.core_library`.
 
 The structures of most handles are public, since Python reads and writes fields of them between two
 calls: it takes rows and counters, answers what a step has asked, and sets descriptors, limits and new
@@ -20,7 +21,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from netem.core.errors import CallerError
 
-LIBRARY = Path(__file__).with_name("libnoack.so")
 CData = Any
 """A structure or pointer of the core: mypy does not know its fields."""
 AnyArray = NDArray[np.generic]
@@ -28,44 +28,93 @@ AnyArray = NDArray[np.generic]
 StructRows = NDArray[np.void]
 """Rows of a structure of the core."""
 Reals = NDArray[np.float64]
-SCRATCH_MATRICES = 10
-"""Matrices of a matrix's size that the core needs for scratch, for its exponential."""
-_REMEDY = "run `make setup` in the repository, or install noack again"
+REMEDY = "run `make setup` in the repository, or install noack again"
 
 try:
-    from netem.core._core_header import SOURCES as SOURCES
+    from netem.core._core_header import NETWORK as NETWORK
+    from netem.core._core_header import SOURCES
     from netem.core._core_header import ffi as ffi
 except ImportError:
-    raise CallerError(f"noack's core in C has not been built; {_REMEDY}") from None
+    raise CallerError(f"noack's core in C has not been built; {REMEDY}") from None
 
 
-def load_core(path: Path) -> CData:
-    """Return the functions and constants of the public headers in a library.
+class CoreLibrary:
+    """A library in C, with the declarations of its public headers.
 
-    Raise CallerError if there is no library that goes with the declarations.
+    Args:
+        path: the library; its name is that of the file without ``lib`` and ``.so``.
+        ffi: the declarations, and those that they include.
+        sources: digest of the sources of the declarations.
+
+    Raises:
+        CallerError: there is no library that goes with the declarations.
     """
-    try:
-        library = ffi.dlopen(str(path))
-        built_from = ffi.string(library.noack_sources()).decode()
-    except (OSError, ffi.error) as error:
-        reason = str(error).rpartition("': ")[2]  # begins with the path
-        raise CallerError(f"noack's core in C cannot be loaded: {reason}; {_REMEDY}") from None
-    if built_from != SOURCES:
-        raise CallerError(f"{path}: was built from other sources than its declarations; {_REMEDY}")
-    return library
 
+    def __init__(self, path: Path, ffi: CData, sources: str) -> None:
+        self.path, self.ffi, self.sources = path, ffi, sources
+        self.functions = self.load(path)
+        """The functions and constants of the headers."""
 
-core: CData = load_core(LIBRARY)
-"""The functions and constants of the headers native/**/public.h."""
+    def load(self, path: Path) -> CData:
+        """Return the functions and constants of another file of this library."""
+        try:
+            library = self.ffi.dlopen(str(path))
+            name = self.path.stem.removeprefix("lib")
+            built_from = ffi.string(getattr(library, f"{name}_sources")()).decode()
+        except (OSError, self.ffi.error) as error:
+            reason = str(error).rpartition("': ")[2]  # begins with the path
+            raise CallerError(f"noack's core in C cannot be loaded: {reason}; {REMEDY}") from None
+        if built_from != self.sources:
+            raise CallerError(f"{path}: was built from other sources than its declarations; {REMEDY}")
+        return library
 
+    def replace(self, path: Path) -> None:
+        """Take the functions from another file of this library, e.g. one with sanitizers."""
+        self.functions = self.load(path)
 
-def require_live_runs() -> None:
-    """Raise CallerError where there are no live runs: the core has its sockets on Linux only."""
-    if not hasattr(core, "noack_drive"):
-        raise CallerError(
-            "live runs and the network emulator need Linux; `noack simulate` runs the same loop in "
-            "virtual time"
-        )
+    def dtype_of(self, name: str) -> np.dtype[np.void]:
+        """Return the row type of a structure of a public header that has numbers and their arrays only.
+
+        >>> dtype_of("noack_window").names
+        ('losses', 'packets')
+        """
+        return _dtype_of(self.ffi.typeof(name))
+
+    def pointer_to(self, array: AnyArray, kind: str) -> CData:
+        """Return a pointer to the rows of a contiguous array, e.g. of kind ``"noack_flow *"``.
+
+        It is valid while the array lives.
+        """
+        if not array.flags.c_contiguous:
+            raise ValueError("the core takes contiguous arrays")
+        return self.ffi.cast(kind, ffi.from_buffer(array))  # faster than numpy's address
+
+    def new_handle(self, kind: str, *arguments: object) -> CData:
+        """Return a new ``noack_KIND *`` of the library, which is freed with the object returned.
+
+        Args:
+            kind: what it is, e.g. ``"link"``.
+            arguments: those of its function ``noack_KIND_new``.
+
+        Raises:
+            ValueError: the core refuses the arguments; the text says why.
+            MemoryError: there is no memory.
+        """
+        wrong = ffi.new("const char **")
+        handle = getattr(self.functions, f"noack_{kind}_new")(*arguments, wrong)
+        require(handle != ffi.NULL, wrong, kind)
+        return ffi.gc(handle, getattr(self.functions, f"noack_{kind}_free"))
+
+    def new_structure(self, kind: str, numbers: Mapping[str, object] = MappingProxyType({})) -> CData:
+        """Return a new structure of a header with these numbers, which functions of the core copy.
+
+        >>> chance = new_structure("noack_chance", {"probability": 0.5})
+        >>> chance.probability
+        0.5
+        """
+        structure = self.ffi.new(f"{kind} *")
+        set_fields(structure, numbers)
+        return structure
 
 
 _FORMATS = {
@@ -80,13 +129,7 @@ _FORMATS = {
 
 
 @cache
-def dtype_of(name: str) -> np.dtype[np.void]:
-    """Return the row type of a structure of a public header that has numbers and their arrays only.
-
-    >>> dtype_of("noack_window").names
-    ('losses', 'packets')
-    """
-    kind = ffi.typeof(name)
+def _dtype_of(kind: CData) -> np.dtype[np.void]:
     return np.dtype(
         {
             "names": [field for field, _ in kind.fields],
@@ -103,33 +146,6 @@ def _format_of(kind: CData) -> DTypeLike:
     return _FORMATS[kind.cname]
 
 
-def pointer_to(array: AnyArray, kind: str) -> CData:
-    """Return a pointer to the rows of a contiguous array, e.g. of kind ``"noack_flow *"``.
-
-    It is valid while the array lives.
-    """
-    if not array.flags.c_contiguous:
-        raise ValueError("the core takes contiguous arrays")
-    return ffi.cast(kind, ffi.from_buffer(array))  # faster than numpy's address
-
-
-def new_handle(kind: str, *arguments: object) -> CData:
-    """Return a new ``noack_KIND *`` of the core, which is freed with the object returned.
-
-    Args:
-        kind: what it is, e.g. ``"link"``.
-        arguments: those of its function ``noack_KIND_new``.
-
-    Raises:
-        ValueError: the core refuses the arguments; the text says why.
-        MemoryError: there is no memory.
-    """
-    wrong = ffi.new("const char **")
-    handle = getattr(core, f"noack_{kind}_new")(*arguments, wrong)
-    require(handle != ffi.NULL, wrong, kind)
-    return ffi.gc(handle, getattr(core, f"noack_{kind}_free"))
-
-
 def require(done: bool, wrong: CData, kind: str) -> None:
     """Raise ValueError with the text that the core has set, or MemoryError, unless a call was ``done``."""
     if not done:
@@ -143,20 +159,8 @@ def address_of(pointer: CData) -> int:
     return int(ffi.cast("intptr_t", pointer))
 
 
-def new_structure(kind: str, numbers: Mapping[str, object] = MappingProxyType({})) -> CData:
-    """Return a new structure of the core with these numbers, which functions of the core copy.
-
-    >>> signal = new_structure("noack_signal", {"width": 2, "values": np.ones((3, 2))})
-    >>> signal.values[5]
-    1.0
-    """
-    structure = ffi.new(f"{kind} *")
-    set_fields(structure, numbers)
-    return structure
-
-
 def set_fields(structure: CData, numbers: Mapping[str, object]) -> None:
-    """Set fields of a structure that :func:`new_structure` has made.
+    """Set fields of a structure that :meth:`CoreLibrary.new_structure` has made.
 
     An array becomes a pointer to a copy of it, which lives as long as the structure; None becomes
     NULL; the fields of a structure within it are a mapping.
@@ -173,7 +177,7 @@ def _set_fields(structure: CData, numbers: Mapping[str, object], arrays: list[An
             whole = number.dtype.kind in "bi"
             array = np.array(number, np.int64 if whole else np.float64, order="C")
             arrays.append(array)
-            setattr(structure, name, pointer_to(array, "int64_t *" if whole else "double *"))
+            setattr(structure, name, ffi.cast("int64_t *" if whole else "double *", ffi.from_buffer(array)))
         else:
             setattr(structure, name, ffi.NULL if number is None else number)
 
@@ -190,5 +194,22 @@ def reals_at(pointer: CData, *shape: int) -> Reals:
 
 def rows_at(pointer: CData, count: int) -> StructRows:
     """Return the rows of a structure at a pointer as an array, which shares their memory."""
-    kind = dtype_of(ffi.typeof(pointer).item.cname)
+    kind = _dtype_of(ffi.typeof(pointer).item)
     return np.frombuffer(ffi.buffer(pointer, count * kind.itemsize), kind)
+
+
+OWN = CoreLibrary(Path(__file__).with_name("libnetem.so"), ffi, SOURCES)
+"""The network's library."""
+core: CData = OWN.functions
+"""The functions and constants of native/{shared,network,relay}/public.h."""
+dtype_of, pointer_to = OWN.dtype_of, OWN.pointer_to
+new_handle, new_structure = OWN.new_handle, OWN.new_structure
+
+
+def require_live_runs() -> None:
+    """Raise CallerError where there are no live runs: the core has its sockets on Linux only."""
+    if not hasattr(core, "noack_relay_run"):
+        raise CallerError(
+            "live runs and the network emulator need Linux; `noack simulate` runs the same loop in "
+            "virtual time"
+        )

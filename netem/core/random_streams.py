@@ -53,7 +53,7 @@ def normals(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float6
 
 
 def uniform_pair(key0: int, key1: int, flow: int = 0, packet: int = 0, block: int = 0) -> tuple[float, float]:
-    """Return two numbers in [0, 1) of a datagram, as the core draws them; see native/random.c."""
+    """Return two numbers in [0, 1) of a datagram, as the core draws them; see native/network/random.c."""
     pair = ffi.new("double[2]")
     core.noack_uniforms(key0, key1, flow, packet, block, pair)
     return pair[0], pair[1]

@@ -14,7 +14,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.core.core_library import SCRATCH_MATRICES, CData, core, ffi, pointer_to
+from netem.core.core_library import CData
+from noack.core.core_library import SCRATCH_MATRICES, core, ffi, pointer_to
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]

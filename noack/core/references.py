@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.core.core_library import CData, core, new_handle, new_structure, pointer_to
+from netem.core.core_library import CData
+from noack.core.core_library import core, new_handle, new_structure, pointer_to
 from noack.core.linear_systems import Matrix, Propagator, Vector
 
 

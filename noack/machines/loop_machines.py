@@ -21,19 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.core.clock import NEVER_NS
-from netem.core.core_library import (
-    CData,
-    Reals,
-    StructRows,
-    core,
-    ffi,
-    new_handle,
-    new_structure,
-    pointer_to,
-    rows_at,
-    set_fields,
-)
+from netem.core.core_library import CData, Reals, StructRows, rows_at, set_fields
 from netem.core.errors import CallerError
+from noack.core.core_library import core, ffi, new_handle, new_structure, pointer_to
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.roles import External, Notice, Record
 from noack.protocol.wire_format import Flow

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netem.channel import Channel
-from netem.core.core_library import CData, core, ffi
+from netem.core.core_library import CData
 from netem.core.errors import CallerError
 from netem.impairments.link_settings import LinkSettings
 from netem.link_state import LinkState
+from noack.core.core_library import core, ffi
+from noack.machines.channel import Channel
 from noack.protocol.record_tables import NETEM_SETTING
 from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message

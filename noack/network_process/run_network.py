@@ -1,6 +1,6 @@
 """The network of a run, which itself waits for, receives and sends datagrams.
 
-It decides as :mod:`netem.channel` does, which replays its record: both call the core
+It decides as :mod:`noack.machines.channel` does, which replays its record: both call the core
 (native/network/link.c), and both number these calls.
 """
 
@@ -110,7 +110,7 @@ class RunNetwork:
         return self._relay.heap[0].due_ns if self._relay.heap_length else None
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Accept a change; see :meth:`netem.channel.Channel.announce`."""
+        """Accept a change; see :meth:`noack.machines.channel.Channel.announce`."""
         return announce_change(self._relay, self._schedule, change, now_ns, self._reached_ns)
 
     def drive(self, until_ns: int, sink: RowSink) -> None:
@@ -199,7 +199,7 @@ class NetworkSockets(CountingSockets):
     Args:
         endpoint: the process's socket.
         routes: source and destination of each direction.
-        network: the network; a datagram's flow is that of :mod:`netem.channel`.
+        network: the network; a datagram's flow is that of :mod:`noack.machines.channel`.
         clock: the run's clock.
         spin_ns: busy-wait for this time before a departure.
         loops: number of loops.

@@ -26,8 +26,9 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from netem.core.core_library import core, pointer_to, reals_at
+from netem.core.core_library import reals_at
 from netem.core.errors import CallerError
+from noack.core.core_library import core, pointer_to
 from noack.core.linear_systems import Matrix
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
 from noack.settings.values import Deviations, MatrixRows, require_length, require_shape, rows_of

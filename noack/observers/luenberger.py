@@ -11,8 +11,8 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import FiniteFloat, model_validator
 
-from netem.core.core_library import core
 from netem.core.errors import CallerError
+from noack.core.core_library import core
 from noack.core.linear_systems import Matrix
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings, observer_gain
 from noack.settings.values import MatrixRows, require_shape

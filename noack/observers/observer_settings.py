@@ -11,8 +11,9 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from netem.core.core_library import CData, new_handle, new_structure
+from netem.core.core_library import CData
 from netem.core.settings_section import ScenarioSection, Table
+from noack.core.core_library import new_handle, new_structure
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.pole_placement import place_poles
 from noack.settings.values import Row, require_length

@@ -18,7 +18,7 @@ Layout, little endian (``docs/wire.md`` has test vectors)::
      32+8n    16  tag over all that precedes it, under the run's key
 
 The tag covers flow, loop, run and sequence number, so that no datagram passes for one of another
-flow or loop. Content is read only after the tag was verified. The core (native/wire.c) reads and
+flow or loop. Content is read only after the tag was verified. The core (native/loop/wire.c) reads and
 writes datagrams, with their tags by keyed BLAKE2b; :class:`EncryptedSeal` encrypts them.
 """
 
@@ -28,7 +28,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netem.core.core_library import CData, core, ffi
+from netem.core.core_library import CData
+from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Vector
 
 KEY_BYTES = 32

@@ -21,8 +21,10 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.core.core_library import CData, core, new_handle, new_structure
+from netem.core.core_library import CData
+from netem.core.core_library import core as network_core
 from netem.core.errors import CallerError
+from noack.core.core_library import new_handle, new_structure
 from noack.core.linear_systems import Matrix, Vector
 
 
@@ -159,7 +161,7 @@ class TriggerRule(NamedTuple):
             since_ns = t_ns
         if not decayed:
             return self
-        share, forecast = float(core.noack_exp(-decayed)), self.forecast
+        share, forecast = float(network_core.noack_exp(-decayed)), self.forecast
         if forecast is not None:
             forecast = forecast._replace(beta=forecast.beta * share)
         level = self.level if self.from_event else self.level * share

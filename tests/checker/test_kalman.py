@@ -9,9 +9,10 @@ from scipy.linalg import expm, solve_discrete_are
 
 from cosim.analysis.witnesses import WitnessedStatement, find_statement
 from cosim.simulation.virtual_time import simulate
-from netem.core.core_library import core, pointer_to, reals_at
+from netem.core.core_library import reals_at
 from netem.core.errors import CallerError
 from noack.core.balls import number
+from noack.core.core_library import core, pointer_to
 from noack.core.linear_systems import Matrix
 from noack.observers.kalman import KalmanSettings
 from noack.observers.observer_settings import EstimationModel

@@ -6,7 +6,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from controller_node.controller import Controller, controllers_of
-from netem.core.core_library import core, ffi
+from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.roles import Notice, Output, Record
 from noack.protocol.wire_format import Flow, Message

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from netem.core.core_library import core, ffi
+from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Vector
 from noack.protocol import wire_format
 

@@ -45,13 +45,13 @@ def test_of_a_server(lossy_udp):
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """noack's wheel, from its source distribution."""
-    return wheel_of_sdist(ROOT, tmp_path_factory.mktemp("noack"))
+    return wheel_of_sdist(ROOT, tmp_path_factory.mktemp("noack"), "noack", "noack/core")
 
 
 @pytest.fixture(scope="module")
 def netem_wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel of the emulator alone."""
-    return wheel_of_sdist(ROOT / "netem", tmp_path_factory.mktemp("netem"), library="core")
+    return wheel_of_sdist(ROOT / "netem", tmp_path_factory.mktemp("netem"), "netem", "core")
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from packaging.requirements import Requirement
 
-from native.build import HEADER, INTO, LIBRARY
+from native.build import HEADER, LIBRARIES
 from tests.helpers.live_runs import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -55,19 +55,20 @@ def built(source: Path, out: Path, kind: str) -> Path:
     return file
 
 
-def wheel_of_sdist(source: Path, scratch: Path, *, library: str | None = None) -> Path:
+def wheel_of_sdist(source: Path, scratch: Path, library: str, folder: str) -> Path:
     """Build a source distribution in an empty folder, and the wheel from what it contains.
 
-    ``library``: the folder in it to which the library in C is given. It is built again only if the
-    source distribution has other sources.
+    ``library`` is the name of its library in C, which is given to ``folder`` in it. It is built again
+    only if the source distribution has other sources.
     """
     sdist = built(source, scratch / "sdist", "sdist")
     with tarfile.open(sdist) as file:
         file.extraction_filter = getattr(tarfile, "data_filter", None)  # Python 3.11.4 and later have it
         file.extractall(scratch / "sources")
     (sources,) = (scratch / "sources").iterdir()
-    for name in (LIBRARY, HEADER) if library else ():
-        shutil.copyfile(INTO / name, sources / str(library) / name)
+    own = LIBRARIES[library]
+    for name in (own.file, HEADER):
+        shutil.copyfile(own.folder / name, sources / folder / name)
     return built(sources, scratch / "wheel", "wheel")
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from cosim.shipped_files import find_shipped, shipped_names
 from cosim.simulation.exact_simulation import run_with_events
 from cosim.simulation.virtual_time import simulate
-from netem.core.core_library import core
+from netem.core.core_library import core as network_core
 from netem.core.errors import CallerError
+from noack.core.core_library import core
 from noack.core.linear_systems import exponential
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
@@ -63,7 +64,7 @@ def _functions() -> None:
     rng = np.random.default_rng(1)
     numbers = np.concatenate([rng.normal(0, scale, 5000) for scale in (0.01, 1.0, 300.0)])
     for name in FUNCTIONS:
-        function = getattr(core, f"noack_{name}")
+        function = getattr(network_core, f"noack_{name}")
         arguments = rng.uniform(0, 1, 15000) if name == "normal_score" else numbers
         _print(name, np.array([function(x) for x in arguments.tolist()]).tobytes())
 

@@ -1,7 +1,6 @@
 """Random machines and exact simulations, for a core that is built with sanitizers."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,9 +9,10 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from cosim.simulation.exact_simulation import ExactSimulation, run_with_events
-from netem.core import core_library
-from netem.core.core_library import core, load_core, new_handle, new_structure
+from netem.core import core_library as network
 from netem.core.errors import CallerError
+from noack.core import core_library as loop
+from noack.core.core_library import new_handle, new_structure
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger_policies.trigger_rule import TriggerRule, new_rule
 from tests.cosim.simulation.exact_populations import random_population, random_setting
@@ -66,8 +66,8 @@ inputs = st.lists(
 
 
 def test_this_is_another_core_than_noacks() -> None:
-    library = Path(core_library.__file__).with_name(core_library.LIBRARY.name)
-    assert core.noack_sources != load_core(library).noack_sources
+    assert network.core.netem_sources != network.OWN.load(network.OWN.path).netem_sources
+    assert loop.core.noack_sources != loop.OWN.load(loop.OWN.path).noack_sources
 
 
 def machines_of(role: str, loops: list[tuple[Sizes, int]], scale: float, **more: Any) -> SteppedMachines:

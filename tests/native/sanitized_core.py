@@ -1,7 +1,7 @@
 """Runs Python with the core built with ASan and UBSan, which end the process at the first mistake.
 
-``python -m tests.native.sanitized_core LIBRARY MODULE ARGUMENTS…`` is the child process: a module
-with that core instead of noack's.
+``python -m tests.native.sanitized_core FOLDER MODULE ARGUMENTS…`` is the child process: a module with
+the core in that folder instead of noack's (``netem/libnetem.so`` and ``noack/libnoack.so``).
 """
 
 import os
@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from native.build import LIBRARY, SANITIZERS, NoCompilerError, build, compiler
+from native.build import LIBRARIES, SANITIZERS, NoCompilerError, build, compiler
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / ".cache" / "sanitized"
@@ -38,7 +38,8 @@ def command(module: str, *arguments: str) -> tuple[list[str], Mapping[str, str]]
     asan = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     if not Path(asan).is_absolute():
         raise NoSanitizersError(f"{command[0]} has no libasan.so")
-    build(FOLDER, *SANITIZERS)
+    for library in LIBRARIES.values():
+        build(library, FOLDER / library.name, *SANITIZERS)
     environment = os.environ | {
         "LD_PRELOAD": asan,
         "ASAN_OPTIONS": f"{_OPTIONS}:{_QUARANTINE}:detect_leaks=0",
@@ -46,21 +47,24 @@ def command(module: str, *arguments: str) -> tuple[list[str], Mapping[str, str]]
         "PYTHONMALLOC": "malloc",  # so that ASan knows the bounds of what Python allocates
         "OPENBLAS_NUM_THREADS": "1",
     }
-    library = str(FOLDER / LIBRARY)
-    return [sys.executable, "-m", __name__, library, module, *arguments], environment
+    return [sys.executable, "-m", __name__, str(FOLDER), module, *arguments], environment
 
 
 def main() -> None:
     """Run a module with another core."""
-    _, library, module, *arguments = sys.argv
-    from netem.core import core_library
+    _, folder, module, *arguments = sys.argv
+    from netem.core import core_library as network
+    from noack.core import core_library as loop
 
     # Nothing has taken functions of the other core yet.
     ours = {name for name in sys.modules if name.startswith(("netem.", "noack."))}
     assert ours <= {
-        f"netem.{name}" for name in ("core", "core.core_library", "core._core_header", "core.errors")
-    }
-    core_library.core = core_library.load_core(Path(library))
+        "netem.core", "netem.core.core_library", "netem.core._core_header", "netem.core.errors",
+        "noack.core", "noack.core.core_library", "noack.core._core_header",
+    }  # fmt: skip
+    for core_library, name in ((network, "netem"), (loop, "noack")):
+        core_library.OWN.replace(Path(folder) / name / core_library.OWN.path.name)
+        core_library.core = core_library.OWN.functions
     sys.argv = [module, *arguments]
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 

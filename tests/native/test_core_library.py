@@ -1,6 +1,7 @@
 """The loader of the core, its build, and the names that Python has for those of the public headers."""
 
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -9,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from native.build import HEADER, is_current
-from netem.core.core_library import LIBRARY, address_of, core, dtype_of, ffi, load_core, pointer_to
+from native.build import HEADER, LIBRARIES, NETEM, is_current
+from netem.core.core_library import OWN, address_of, core, dtype_of, ffi, pointer_to
 from netem.core.errors import CallerError
 from netem.core.packet_rows import Fate
 from netem.impairments.feature import StageTables
 from netem.impairments.link_settings import Counters
+from noack.core import core_library as loop
 from tests.netem.impairments.feature_examples import IMPAIRED, names_file
 
 ROOT = Path(__file__).parents[2]
@@ -29,18 +31,32 @@ def test_a_pointer_has_the_address_of_its_array() -> None:
 
 
 def test_a_missing_or_broken_or_other_library_is_refused_in_one_line(tmp_path: Path) -> None:
-    own = ffi.string(core.noack_sources())
-    other = LIBRARY.read_bytes().replace(own, own[::-1])
+    own = ffi.string(core.netem_sources())
+    other = OWN.path.read_bytes().replace(own, own[::-1])
     for number, content in enumerate((None, b"", b"no library", other)):
         path = tmp_path / f"{number}.so"
         if content is not None:
             path.write_bytes(content)
         with pytest.raises(CallerError) as error:
-            load_core(path)
+            OWN.load(path)
         says = str(path) if number < 3 else "built from other sources"
         assert says in str(error.value)
         assert "make setup" in str(error.value)
         assert str(error.value).isprintable()
+
+
+def test_libraries_with_two_versions_of_the_network_are_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("netem.core.core_library.NETWORK", "other sources")
+    with pytest.raises(CallerError, match="are of two versions") as error:
+        runpy.run_path(loop.__file__)
+    assert str(error.value).isprintable()
+
+
+def test_the_loops_library_takes_the_networks_structures() -> None:
+    for name in ("noack_link *", "noack_stage *", "noack_packet_row *", "noack_clock *"):
+        assert loop.ffi.typeof(name) is ffi.typeof(name)
 
 
 def test_a_command_without_the_core_says_so_without_a_traceback(tmp_path: Path) -> None:
@@ -99,7 +115,7 @@ def copy(tmp_path: Path) -> Path:
 def build(native: Path, *arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """Build into the folder beside ``native``."""
     return subprocess.run(
-        [sys.executable, native / "build.py", "--into", native.parent / "core", *arguments],
+        [sys.executable, native / "build.py", "netem", "--into", native.parent / "core", *arguments],
         env=os.environ | environment, capture_output=True, text=True, check=False, timeout=200,
     )  # fmt: skip
 
@@ -115,24 +131,24 @@ needs_compiler = pytest.mark.skipif(
 
 
 def test_the_core_of_this_repository_is_that_of_its_sources() -> None:
-    assert is_current(), "run `make setup`"
+    assert all(map(is_current, LIBRARIES.values())), "run `make setup`"
 
 
 @needs_compiler
 def test_a_build_compiles_only_what_has_changed_and_says_so_in_one_line(copy: Path) -> None:
-    first = build(copy, "--library")
+    first = build(copy, "--library-alone")
     assert (first.returncode, first.stderr) == (0, "")
     assert len(first.stdout.splitlines()) == 1
-    assert files(copy).keys() == {LIBRARY.name}
+    assert files(copy).keys() == {NETEM.file}
     assert build(copy).stdout == ""  # the declarations, which takes no time
     made = files(copy)
-    assert made.keys() == {LIBRARY.name, HEADER}
+    assert made.keys() == {NETEM.file, HEADER}
     again = build(copy)
     assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
     (copy.parent / "core" / HEADER).unlink()
     assert build(copy).stdout == ""
     assert files(copy) == made
-    with (copy / "core.h").open("a") as file:
+    with (copy / "network" / "network.h").open("a") as file:
         file.write("/* changed */\n")
     assert build(copy).stdout == first.stdout
     assert files(copy)[HEADER] != made[HEADER]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from native.build import FLAGS, LIBRARY, build, compiler, sources
+from native.build import FLAGS, LIBRARIES, NETEM, NOACK, build, compiler, sources
 
 pytestmark = pytest.mark.system
 FORMATS = {  # the first bytes: the format, and the processor at its place
@@ -23,13 +23,19 @@ needs_ziglang = pytest.mark.skipif(
 
 @needs_ziglang
 @pytest.mark.parametrize("platform", FORMATS)
-def test_a_platform_has_its_library(platform: str, tmp_path: Path) -> None:
-    build(tmp_path, "-O0", "-Werror", target=platform)  # as it is built, but in less time
-    library = (tmp_path / LIBRARY).read_bytes()
+@pytest.mark.parametrize("name", LIBRARIES)
+def test_a_platform_has_its_libraries(name: str, platform: str, tmp_path: Path) -> None:
+    of = LIBRARIES[name]
+    build(of, tmp_path, "-O0", "-Werror", target=platform)  # as it is built, but in less time
+    library = (tmp_path / of.file).read_bytes()
     start, place, processor = FORMATS[platform]
     assert (library[: len(start)], library[place:][: len(processor)]) == (start, processor)
-    assert b"noack_exact_runs" in library
-    assert (b"noack_relay_run" in library) == ("linux" in platform)
+    function, of_live_runs = {
+        "netem": (b"noack_link_decide", b"noack_relay_run"),
+        "noack": (b"noack_exact_runs", b"noack_drive"),
+    }[name]
+    assert function in library
+    assert (of_live_runs + b"\0" in library) == ("linux" in platform)
     assert str(tmp_path).encode() not in library
     versions = [(2, int(minor)) for minor in re.findall(rb"GLIBC_2\.(\d+)", library)]
     assert max(versions, default=(2, 17)) == (2, 17)
@@ -39,5 +45,5 @@ def test_a_platform_has_its_library(platform: str, tmp_path: Path) -> None:
 def test_windows_can_compile_every_file(tmp_path: Path) -> None:
     """It is linked by ``make dist`` only: ziglang first builds Windows' libraries for minutes."""
     command = [*compiler("win_amd64"), *FLAGS, "-Werror", "-O0", "-c", "-DN=4"]
-    for file in sources("win_amd64"):
+    for file in {*sources(NETEM, "win_amd64"), *sources(NOACK, "win_amd64")}:
         subprocess.run([*command, str(file), "-o", str(tmp_path / f"{file.stem}.o")], check=True)

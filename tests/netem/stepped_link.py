@@ -7,7 +7,7 @@ from netem.impairments.link_settings import Counters, LinkSettings
 from netem.link_state import LinkState
 from noack.machines.run_channel import Datagram, RunChannel, UserNetwork
 from noack.protocol.roles import Notice, Record
-from tests.netem.stepped_channel import SteppedChannel
+from tests.noack.machines.stepped_channel import SteppedChannel
 
 
 class Link:

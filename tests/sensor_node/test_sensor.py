@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from netem.core.core_library import core, ffi
+from noack.core.core_library import core, ffi
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, tables
 from noack.protocol.roles import Output, Record
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire

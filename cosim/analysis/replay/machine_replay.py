@@ -17,10 +17,11 @@ from cosim.analysis.summary.summary_model import ReplayDifference
 from cosim.record.rows import Rows, Slice
 from cosim.record.run_record import RunRecord
 from netem.core.clock import NEVER_NS
-from netem.core.core_library import CData, core, ffi, pointer_to
+from netem.core.core_library import CData
 from netem.core.errors import CallerError
 from netem.core.packet_rows import NETEM_RELEASE, PACKET_HEAD_BYTES
 from noack.core.cached_method import cached_method
+from noack.core.core_library import core, ffi, pointer_to
 from noack.machines.loop_machines import LoopMachines, MachinePart
 from noack.machines.run_channel import RunChannel, channel_of
 from noack.protocol.record_tables import (

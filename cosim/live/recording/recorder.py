@@ -24,11 +24,11 @@ from cosim.record.rows import Rows, messages_in
 from cosim.record.run_directory import RECORDING_FILE, active_run
 from netem.core.clock import NS_PER_S
 from netem.core.command_line import END_SIGNALS, print_to_stderr
-from netem.core.core_library import core
 from netem.core.errors import ExitStatus, MachineError, PeerError
 from netem.core.file_access import remove_file
 from netem.core.number_format import counted
 from netem.core.packet_rows import NETEM_PACKET, effective
+from noack.core.core_library import core
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import expm
 
-from netem.core.core_library import SOURCES
 from netem.core.errors import shortened
+from noack.core.core_library import OWN
 
 _PACKAGES = ("noack", "numpy", "scipy")
 _CODE = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
@@ -31,7 +31,7 @@ def arithmetic() -> Mapping[str, str]:
         **{name: _version(name) for name in _PACKAGES},
         "Python": ".".join(platform.python_version_tuple()[:2]),
         "noack's code": _code(),
-        "noack's core": SOURCES,
+        "noack's core": OWN.sources,
         "machine": platform.machine(),
         "rounding": _rounding(),
     }

@@ -13,7 +13,8 @@ from contextlib import suppress
 
 from netem.core.address import Address, SocketName, packed_name
 from netem.core.clock import RunClock
-from netem.core.core_library import CData, core, ffi, new_handle
+from netem.core.core_library import CData
+from noack.core.core_library import core, ffi, new_handle
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.wire_format import (
     HEADER_BYTES,

@@ -45,7 +45,7 @@ from netem.output.result_tables import ResultTable
 from noack.protocol.record_tables import COMMON, LOOP, PLANT_STEP, TABLES, Column, Table
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 from tests.fuzz.parsers.record import NOTICE, files, spooled
-from tests.netem.stepped_channel import flipped
+from tests.noack.machines.stepped_channel import flipped
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from noack.scenario.resolution import tables_of
 from noack.scenario.scenario import Scenario
 from tests.helpers.machine_parts import Machine, controller_of, plant_of, sensor_of
 from tests.helpers.wire_decoder import Decoder
-from tests.netem.stepped_channel import SteppedChannel
+from tests.noack.machines.stepped_channel import SteppedChannel
 
 KEY = bytes(KEY_BYTES)
 MACHINES: Mapping[str, Callable[[Scenario], Machine[Any]]] = {

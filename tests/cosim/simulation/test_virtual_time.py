@@ -7,8 +7,8 @@ import pytest
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import VirtualRun, simulate
-from netem.core.core_library import ffi, new_handle
 from netem.core.packet_rows import NETEM_PACKET
+from noack.core.core_library import ffi, new_handle
 from noack.machines.run_channel import channel_of
 from noack.protocol.record_tables import CONTROLLER_DELIVERY
 from noack.scenario.resolution import ResolvedRun, resolve

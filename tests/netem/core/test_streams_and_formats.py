@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from netem.core.core_library import _ARRAYS, ffi, new_structure, reals_at, set_fields
+from netem.core.core_library import _ARRAYS, reals_at, set_fields
 from netem.core.number_format import at_least, at_most, plus_minus
 from netem.core.random_streams import stream, stream_key, stream_keys, uniforms, words
+from noack.core.core_library import ffi, new_structure
 
 
 def test_a_stream_is_the_documented_generator() -> None:

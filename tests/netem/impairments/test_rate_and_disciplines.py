@@ -13,7 +13,6 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from netem.channel import Channel
 from netem.core.core_library import core
 from netem.impairments.disciplines.codel import Codel
 from netem.impairments.disciplines.earliest_deadline import EarliestDeadline
@@ -25,8 +24,9 @@ from netem.impairments.kinds.rate import Rate
 from netem.impairments.link_settings import LinkSettings
 from netem.link_state import LinkState
 from netem.tc_words import settings_of, words_of
-from tests.netem.stepped_channel import send
+from noack.machines.channel import Channel
 from tests.netem.stepped_link import Link
+from tests.noack.machines.stepped_channel import send
 
 NS = 10**9
 

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from controller_node.controller import Controller
 from netem.core.clock import NEVER_NS
-from netem.core.core_library import ffi, new_handle
 from netem.core.periods import Period
 from netem.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
@@ -20,6 +19,7 @@ from netem.guarantee.loss_guarantee import (
 )
 from noack.controllers.controller_settings import ControlFailedError
 from noack.controllers.linear_feedback import LinearFeedback
+from noack.core.core_library import ffi, new_handle
 from noack.core.linear_systems import Matrix, Vector, norm, product
 from noack.core.references import Reference, ReferenceSegment
 from noack.machines.loop_machines import LoopMachines

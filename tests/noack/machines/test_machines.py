@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller_node.controller import Controller
-from netem.core.core_library import ffi, new_handle, pointer_to
 from netem.core.errors import CallerError
+from noack.core.core_library import ffi, new_handle, pointer_to
 from noack.core.linear_systems import Vector
 from noack.core.references import Reference, ReferenceSegment
 from noack.machines import loop_machines

@@ -32,7 +32,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.netem.impairments import any_link_settings as any_settings
 from tests.netem.relay.relays import PATIENCE_S, Received, drain, endpoints, name_of
-from tests.netem.stepped_channel import SteppedChannel
+from tests.noack.machines.stepped_channel import SteppedChannel
 
 NEVER_NS = 2**61
 Arrival = tuple[int, int, int]

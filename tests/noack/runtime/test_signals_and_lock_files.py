@@ -66,7 +66,7 @@ TERM = (signal.SIGTERM, 143, "stopped on request (SIGTERM)")
     [
         (["cosim.cli", "typer", "--version"], INT),
         (["netem", "netem.core.system_processes", "--help"], INT),
-        (["noack.network_process", "netem.channel", "--help"], INT),
+        (["noack.network_process", "noack.machines.channel", "--help"], INT),
         (["plant_server", "noack.runtime.run_process", "--help"], TERM),
     ],
 )

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.core.core_library import core
+from noack.core.core_library import core
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import Record
 from noack.protocol.wire_format import TAG_BYTES, Flow, Message, Rejection

@@ -1,4 +1,4 @@
-"""A network as a machine without sockets: native/network/channel.c decides, this configures it.
+"""A network as a machine without sockets: native/driver/channel.c decides, this configures it.
 
 Its one or two directions are independent: each has its own settings, random streams and guarantee.
 Each direction has the same number of flows: 0 to N − 1 are the first direction's, the next N the
@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.core.core_library import CData, core, ffi, new_handle, pointer_to, rows_at
+from netem.core.core_library import CData, rows_at
 from netem.core.packet_rows import NETEM_PACKET, NETEM_RELEASE, PACKET_ROW
 from netem.impairments.link_settings import LinkSettings
 from netem.link_state import LinkState
+from noack.core.core_library import core, ffi, new_handle, pointer_to
 
 Rows = NDArray[np.void]
 

@@ -5,7 +5,7 @@
    record, numbered over both directions. */
 #include <stdlib.h>
 
-#include "../core.h"
+#include "channel.h"
 
 enum { FIRST_PLACES = 64, ROWS = 4096 };
 
@@ -150,7 +150,7 @@ int64_t noack_channel_handle(
     channel->answered = 0;
     channel->reached_ns = now_ns;
     serve(link, channel->waiting, now_ns, channel->heap, &channel->heap_count);
-    link->flows[row].error_level = noack_wire_error_level(datagram->head, datagram->size_bytes);
+    link->flows[row].error_level = header_error_level(datagram->head, datagram->size_bytes);
     if (asks)
         decide_for(link, row, datagram->size_bytes, now_ns, &channel->outcome_ns, &decision);
     else

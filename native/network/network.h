@@ -1,70 +1,19 @@
-/* What the files of the core share. The library hides all names but those of the public headers. */
-#ifndef NOACK_CORE_H
-#define NOACK_CORE_H
+/* What the files of the network share: the state of a link, and what a stage does with a packet. */
+#ifndef NOACK_NETWORK_H
+#define NOACK_NETWORK_H
 
-#include <stddef.h>
-#include <stdint.h>
-#include <string.h>
+#include "../shared/shared.h"
 
-#include "elementary.h"
-
-#pragma GCC visibility push(default) /* what Python calls; all else is hidden */
+#pragma GCC visibility push(default)
 #include "public.h"
-#include "loop/public.h"
-#include "network/public.h"
-#include "driver/public.h"
-#include "relay/public.h"
-#include "exact/public.h"
 #pragma GCC visibility pop
 
-#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
-#error "datagrams and rows are little endian, and so must be the processor"
-#endif
+/* run_header.c: the number in a header, not verified; -1: the datagram is too short. */
+int64_t header_loop(const uint8_t *datagram, int64_t size_bytes);
+int64_t header_flow(const uint8_t *datagram, int64_t size_bytes);
 
-/* Functions of libm whose last bits depend on the library. */
-#undef log2 /* a macro of newlib */
-#pragma GCC poison exp exp2 expm1 log log2 log10 log1p pow cbrt hypot erf erfc
-#pragma GCC poison sin cos tan asin acos atan atan2 sinh cosh tanh
-
-#define NS_PER_S INT64_C(1000000000)
-/* 73 years: packets that must pass may exceed a queue's size. */
-#define LATEST_NS (INT64_C(1) << 61)
-
-enum { LINE_BYTES = 64 };    /* of the processor's caches */
-enum { MOST_LOOPS = 65535 }; /* of a run: datagrams have the number of the loop in 16 bits */
-
-static inline int64_t max_of(int64_t a, int64_t b) { return a > b ? a : b; }
-static inline int64_t min_of(int64_t a, int64_t b) { return a < b ? a : b; }
-static inline int is_between(int64_t least, int64_t number, int64_t most) {
-    return least <= number && number <= most;
-}
-
-/* Division and remainder that round towards minus infinity, as Python's do; b > 0. */
-static inline int64_t floor_div(int64_t a, int64_t b) { return a / b - (a % b < 0); }
-static inline int64_t floor_mod(int64_t a, int64_t b) { return a % b + (a % b < 0 ? b : 0); }
-
-/* memory.c: zeros, or a copy, of a number of elements; NULL if there is no memory. */
-void *zeros(int64_t count, size_t size);
-void *copy_of(const void *elements, int64_t count, size_t size);
-/* Lengthen an array, to which `array` points, by zeros; return 0 if there is no memory. */
-int lengthen(void *array, int64_t before, int64_t after, size_t size);
-
-/* An array of a structure: where its pointer is, and how many numbers of 8 bytes it has. */
-enum { NEEDED, OPTIONAL, STATE }; /* one that is not given is missing, stays NULL, or is 0 */
-typedef struct {
-    void *pointer;
-    int64_t count;
-    int kind;
-} owned_array;
-
-/* Return a copy of a structure with copies of its arrays, in one piece of memory that is to be
-   freed; NULL if there is no memory, or if an array is missing, which is then what is wrong. */
-void *with_arrays(
-    void *structure, size_t size, const owned_array *arrays, int count, const char *missing,
-    const char **wrong);
-
-/* Zeros that begin at a cache line, in memory that is to be freed. */
-void *zeros_in_lines(int64_t count, size_t size, void **memory);
+/* The error level in the header of an update, not verified; 0: there is none. */
+int64_t header_error_level(const uint8_t *datagram, int64_t size_bytes);
 
 /* A stage's memory of a flow. */
 typedef struct {
@@ -199,19 +148,6 @@ static inline void draw(
         packet->copy * MOST_DRAWS + block, uniform);
 }
 
-/* The first place in [begin, end) with a number above value; else end. The numbers ascend. */
-static inline int64_t first_above(
-    const int64_t *numbers, int64_t begin, int64_t end, int64_t value) {
-    while (begin < end) {
-        int64_t middle = begin + (end - begin) / 2;
-        if (numbers[middle] <= value)
-            begin = middle + 1;
-        else
-            end = middle;
-    }
-    return begin;
-}
-
 /* random.c: correlated random events. */
 double latent(double correlation, double innovation, noack_stage_memory *memory, double u);
 int happens(const noack_chance *chance, noack_stage_memory *memory, double u);
@@ -234,15 +170,6 @@ static inline int fits_queue(
 int codel_is_due(const noack_link *link, int64_t stage);
 void codel_drop(noack_link *link, int64_t stage, int64_t bytes);
 
-/* loop/process.c: let the processor fetch the memory of a machine, which is needed soon. Without it
-   the step of one of a thousand loops waits for it. */
-void fetch_machine(const noack_process *process, int64_t loop);
-
-/* clock.c, and driver.c: readings of a clock. */
-int64_t noack_simulated_ns_of(const noack_clock *clock, int64_t wall_ns);
-int64_t clock_ns(int clock);
-int64_t run_time_ns(const noack_clock *clock);
-
 /* guarantee.c */
 int counts_losses(const noack_link *link);
 int64_t make_stale(const noack_link *link, int64_t row, int64_t packet, int64_t release_ns);
@@ -258,13 +185,6 @@ noack_packet_row packet_row(
 int is_first_intact(const noack_decision *decision, int copy);
 /* At equal times, datagrams leave in order of direction, then of arrival, which is counted. */
 int64_t departure_order(int64_t direction, int64_t delayed_count);
-
-/* heap.c */
-
-/* There must be room. */
-void noack_heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry);
-/* Remove the first entry. */
-void noack_heap_pop(noack_heap_entry *heap, int64_t *count);
 
 /* Whether the queue of a stage chooses when its link is free (waiting.c). */
 static inline int is_scheduler(const noack_stage *stage) {
@@ -287,28 +207,6 @@ void wait_for_link(
 void serve(
     noack_link *link, noack_waiting *waiting, int64_t now_ns, noack_heap_entry *heap,
     int64_t *count);
-
-/* Copy what a message has: it may have few entries. */
-static inline void copy_message(noack_message *to, const noack_message *from) {
-    memcpy(to, from, offsetof(noack_message, vector) + (size_t)from->entries * sizeof(double));
-}
-
-/* Copy what a datagram has. */
-static inline void copy_datagram(noack_datagram *to, const noack_datagram *from) {
-    size_t entries = (size_t)from->message.entries;
-    memcpy(to, from, offsetof(noack_datagram, message.vector) + entries * sizeof(double));
-}
-
-/* wire.c: a message's datagram without its tag, of which the size is returned; its tag;
-   and whether bytes that were received are a tag. */
-int64_t write_content(const noack_wire *wire, const noack_message *message, uint8_t *datagram);
-void write_tag(const noack_wire *wire, int64_t content_bytes, uint8_t *datagram);
-int is_tag(const uint64_t tag[NOACK_TAG_BYTES / 8], const uint8_t *bytes);
-
-/* wire.c: the header of a message's datagram; and the tests of an authentic datagram. */
-void noack_wire_header(const noack_wire *wire, const noack_message *message, uint8_t *header);
-int64_t noack_wire_examine_message(
-    const noack_reception *reception, int64_t from_peer, const noack_message *message);
 
 /* link.c: decide by the stages, or, unless it is NULL, as the user's network did. */
 void decide_for(

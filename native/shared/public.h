@@ -1,7 +1,7 @@
-/* What Python uses of the core: numbers, wire and clock here; each room has its own public.h.
+/* What Python uses of numbers and clocks; each room has its own public.h.
 
-   native/build.py gives these files, in the order of core.h, to cffi, and netem/core/core_library.py
-   makes numpy's row types of them. Therefore they have declarations, enumerations and comments only;
+   native/build.py gives these files to cffi, and netem/core/core_library.py makes numpy's row types
+   of them. Therefore they have declarations, enumerations and comments only;
    every number is a double or an integer of a stated width. Times are integer nanoseconds. What
    noack_..._new returns owns its memory, until noack_..._free. Machines, link and simulators call no
    clock and no socket; the driver and the relay do.
@@ -9,22 +9,9 @@
    The comment of a field stands beside it, a long one above it. A blank line begins a group of
    fields, whose heading may follow. */
 
-/* ---- Arithmetic in a fixed order: the same bits on every processor --------------------------- */
+/* ---- Functions with the same bits on every processor ----------------------------------------- */
 
-/* result = M v; M is (rows, columns). The result must not overlap v. */
-void noack_product(
-    int64_t rows, int64_t columns, const double *matrix, const double *vector, double *result);
-
-/* Each of `count` states, (count, n), becomes M^j times it, with its own j < 2^bits of `steps`,
-   whose bits are followed from the lowest one. powers: M^(2^b), (bits, n, n); scratch: (n). */
-void noack_advance_by_periods(
-    int64_t n, int64_t bits, const double *powers, int64_t count, const int64_t *steps,
-    double *states, double *scratch);
-
-/* The Euclidean norm of a vector, without overflow of squares. */
-double noack_norm(int64_t count, const double *vector);
-
-/* e^x, e^x - 1, ln x, and the cube root of x >= 0. See native/elementary.h. */
+/* e^x, e^x - 1, ln x, and the cube root of x >= 0. See elementary.h. */
 double noack_exp(double x);
 double noack_expm1(double x);
 double noack_log(double x);
@@ -33,10 +20,12 @@ double noack_cube_root(double x);
 /* Sine and cosine of 2 pi times a number of turns below 2^50. */
 void noack_sine_and_cosine(double turns, double sine_and_cosine[2]);
 
-/* result = e^M, (n, n); scratch: (10, n, n). See native/loop/exponential.c. */
-void noack_exponential(int64_t n, const double *matrix, double *result, double *scratch);
+/* ---- The clock of a run, and what its sockets need ------------------------------------------- */
 
-/* ---- The clock of a run ---------------------------------------------------------------------- */
+enum {
+    NOACK_NAME_BYTES = 40, /* room for a socket address (IPv6: 28 bytes), or a 5-tuple */
+    NOACK_ERRNOS = 256
+};
 
 /* The clock of a run, as netem.core.clock: simulated time since the run's epoch. */
 typedef struct {

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Sequence
 
-from netem.channel import Channel
 from netem.core.clock import NEVER_NS
-from netem.core.core_library import core, ffi
 from netem.core.packet_rows import PACKET_HEAD_BYTES
+from noack.core.core_library import core, ffi
+from noack.machines.channel import Channel
 from noack.machines.run_channel import Datagram, RunChannel
 from noack.protocol.roles import Notice, Record
 from noack.scenario.parameter_changes import ParameterChange

@@ -3,7 +3,7 @@
    contracted.
 
    Of libm the core uses only what is exact or correctly rounded: sqrt, fma, floor, ceil, fabs,
-   fmin, fmax, frexp, ldexp. The others differ in last bits; core.h forbids their names.
+   fmin, fmax, frexp, ldexp. The others differ in last bits; shared.h forbids their names.
 
    e^x = 2^(k/32) e^r with the integer k nearest to 32 x/ln 2, so |r| <= ln 2/64. The powers
    2^(i/32) are sums of two numbers, the first of 26 bits; r is the sum of a multiple of 2^-32 and a

@@ -1,5 +1,5 @@
 /* Elementary functions with the same bits everywhere; elementary.h says how. */
-#include "core.h"
+#include "shared.h"
 
 const two_part NOACK_POWERS_OF_2[32] = {
     {0x1p+0, 0.0},

@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.core.core_library import new_handle
 from netem.core.packet_rows import PACKET_HEAD_BYTES, Fate
 from netem.impairments.link_settings import LinkSettings
 from netem.link_state import LinkState
+from noack.core.core_library import new_handle
 from noack.machines.run_channel import Datagram, RunChannel, channel_of
 from noack.protocol.roles import Record
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.netem.impairments.any_link_settings import capped, computable, harsh
-from tests.netem.stepped_channel import SteppedChannel
+from tests.noack.machines.stepped_channel import SteppedChannel
 
 LOOPS = 4
 any_link = st.one_of(computable, harsh, capped)

@@ -1,5 +1,5 @@
 /* The clock of a run: simulated time as a function of this host's monotonic clock. */
-#include "core.h"
+#include "shared.h"
 
 #include <math.h>
 

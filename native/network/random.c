@@ -1,5 +1,5 @@
 /* Counter-based random numbers, the normal distribution, and correlated random events. */
-#include "core.h"
+#include "network.h"
 
 /* Philox4x32-10 (Salmon, Moraes, Dror & Shaw, SC 2011): four random words of 32 bits for a counter
    of four words and a key of two. */

@@ -1,21 +1,9 @@
 /* The wire format of docs/wire.md: datagrams and the tests that a receiver makes. */
-#include "core.h"
-
 #include <math.h>
 #include <string.h>
 
-enum {
-    VERSION = 1,
-    ENCRYPTED_VERSION = 2,
-    FLOW = 3,
-    DIMENSION = 4,
-    ERROR_LEVEL = 5,
-    LOOP = 6,
-    RUN = 8,
-    SEQUENCE = 16,
-    TIME = 24,
-    VECTOR = 32
-};
+#include "../network/run_header.h"
+#include "loop.h"
 
 typedef uint64_t word;
 #define OF_ALL(number) (number)
@@ -79,21 +67,6 @@ int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, 
     return content_bytes + NOACK_TAG_BYTES;
 }
 
-int64_t noack_wire_loop(const uint8_t *datagram, int64_t size_bytes) {
-    return size_bytes < NOACK_HEADER_BYTES ? -1 : datagram[LOOP] | datagram[LOOP + 1] << 8;
-}
-
-int64_t noack_wire_flow(const uint8_t *datagram, int64_t size_bytes) {
-    return size_bytes < NOACK_HEADER_BYTES ? -1 : datagram[FLOW];
-}
-
-int64_t noack_wire_error_level(const uint8_t *datagram, int64_t size_bytes) {
-    if (noack_wire_flow(datagram, size_bytes) != NOACK_UPDATE || datagram[0] != 'N'
-        || datagram[1] != 'A' || (datagram[2] != VERSION && datagram[2] != ENCRYPTED_VERSION))
-        return 0;
-    return datagram[ERROR_LEVEL];
-}
-
 /* The tests that need no key: they reject most invalid input and name common mistakes. */
 static int64_t examine_header(
     const noack_wire *wire, const noack_reception *reception, int64_t loop, const uint8_t *datagram,
@@ -111,7 +84,7 @@ static int64_t examine_header(
         return NOACK_BAD_RUN;
     if (datagram[FLOW] != reception->flow)
         return NOACK_BAD_FLOW;
-    return noack_wire_loop(datagram, size_bytes) == loop ? NOACK_ACCEPTED : NOACK_BAD_LOOP;
+    return header_loop(datagram, size_bytes) == loop ? NOACK_ACCEPTED : NOACK_BAD_LOOP;
 }
 
 int is_tag(const uint64_t tag[NOACK_TAG_BYTES / 8], const uint8_t *bytes) {

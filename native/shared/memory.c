@@ -1,7 +1,7 @@
 /* Memory of handles: arrays of zeros, and copies of what the caller has. */
 #include <stdlib.h>
 
-#include "core.h"
+#include "shared.h"
 
 void *zeros(int64_t count, size_t size) { return calloc((size_t)max_of(count, 1), size); }
 

@@ -3,7 +3,7 @@
    Datagrams that wait come first, as after a stall of this process. Else housekeeping waits for a
    step, and for a moment after it: the receivers of its messages come first, and the next step is
    usually a period away. It must not make a tick or a delayed datagram late. */
-#include "core.h"
+#include "shared.h"
 
 enum {
     QUIET_NS = 500000, /* housekeeping in Python nearly always takes less time */

@@ -1,5 +1,5 @@
 /* A heap of what is due: delayed datagrams, or the next ticks of loops. */
-#include "core.h"
+#include "shared.h"
 
 static int is_before(const noack_heap_entry *a, const noack_heap_entry *b) {
     return a->due_ns < b->due_ns || (a->due_ns == b->due_ns && a->number < b->number);
