@@ -1,14 +1,14 @@
 /* One direction of a link: decisions for arriving packets, and accounting of departures.
 
    How a packet is lost: the relay of a live run (native/relay/loop.c) or the channel of a simulated
-   one (channel.c) has received a datagram of a flow, and asks for a decision. decide_for applies
-   the stages of native/impairments/ in order, each to every packet, lost or not, and to its
-   duplicate, if an earlier stage made one. A stage, or the limit of packets in flight, loses such a
-   copy by lose (network.h), unless the packet must pass (noack_must_pass) and has no other. The
-   packet is lost if no copy is left. noack_settle completes the decision. A packet that only
-   arrives corrupted is lost, too. One that leaves before earlier ones makes these stale: they are
-   lost as well, and it is held back if that would break the guarantee. The consecutive losses up to
-   it are what noack_must_pass compares with M - 1 for the next packet.
+   one (native/driver/channel.c) has received a datagram of a flow, and asks for a decision.
+   decide_for applies the stages of native/impairments/ in order, each to every packet, lost or not,
+   and to its duplicate, if an earlier stage made one. A stage, or the limit of packets in flight,
+   loses such a copy by lose (network.h), unless the packet must pass (noack_must_pass) and has no
+   other. The packet is lost if no copy is left. noack_settle completes the decision. A packet that
+   only arrives corrupted is lost, too. One that leaves before earlier ones makes these stale: they
+   are lost as well, and it is held back if that would break the guarantee. The consecutive losses
+   up to it are what noack_must_pass compares with M - 1 for the next packet.
 
    A lost packet has no departure, so its datagram is passed on to nobody, and nobody is told. Those
    that are corrupted or stale are sent; their receiver rejects them (native/loop/wire.c). */
