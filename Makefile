@@ -222,7 +222,7 @@ define BUILD_CORE
 endef
 
 $(VENV)/.dependencies: requirements.lock | $(VENV)/bin/python
-	@# On another core meanwhile the library in C; the target core reports what fails of it.
+	@# On another core meanwhile the libraries in C; the target core reports what fails of it.
 	@# pip would compile the modules on one core. Nobody runs the packages' own tests.
 	@{ $(call BUILD_CORE,--library-alone); } 2> /dev/null & \
 		$(SAY) "installing pinned dependencies" $(PIP) --no-compile -r requirements.lock && \
