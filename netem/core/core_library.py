@@ -68,10 +68,6 @@ class CoreLibrary:
             raise CallerError(f"{path}: was built from other sources than its declarations; {REMEDY}")
         return library
 
-    def replace(self, path: Path) -> None:
-        """Take the functions from another file of this library, e.g. one with sanitizers."""
-        self.functions = self.load(path)
-
     def dtype_of(self, name: str) -> np.dtype[np.void]:
         """Return the row type of a structure of a public header that has numbers and their arrays only.
 

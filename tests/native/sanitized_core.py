@@ -63,8 +63,8 @@ def main() -> None:
         "noack.core", "noack.core.core_library", "noack.core._core_header",
     }  # fmt: skip
     for core_library, name in ((network, "netem"), (loop, "noack")):
-        core_library.OWN.replace(Path(folder) / name / core_library.OWN.path.name)
-        core_library.core = core_library.OWN.functions
+        own = core_library.OWN
+        core_library.core = own.functions = own.load(Path(folder) / name / own.path.name)
     sys.argv = [module, *arguments]
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 
