@@ -9,24 +9,12 @@ from collections.abc import Sequence
 from netem.core.command_line import Parser
 from netem.core.console import SafeConsole
 from netem.core.errors import ExitStatus
-from netem.measurement.flow_table import flows_document
-from netem.measurement.iperf3_table import iperf3_document
-from netem.measurement.loss_bursts import WINDOWS
-from netem.measurement.measure_options import period_ns, refuse, share, time_s
+from netem.measurement.measure_arguments import MeasureArguments, measure_sources
 from netem.measurement.measured_preset import preset_path, write_preset
 from netem.measurement.measurement_document import measurement_document
-from netem.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
-from netem.measurement.trace_sources import (
-    FILE_OPTIONS,
-    SourceOptions,
-    is_iperf3_file,
-    read_files,
-    refuse_unused,
-)
 from netem.output.document import Document
 from netem.output.json_writer import print_json
 from netem.output.terminal_writer import print_document
-from netem.traces.packet_trace import find_trace
 
 _EXAMPLES = """examples:
   noack-netem measure urban_n78_40kmh --deadline 100ms --survival 120ms
@@ -41,38 +29,17 @@ def measure(arguments: Sequence[str]) -> ExitStatus:
     Raises:
         NoackError: one line; a file cannot be read, or an option is wrong.
     """
-    options = _parser().parse_args(arguments)
-    paths = [*map(find_trace, options.sources)]
-    preset = None if options.preset is None else preset_path(options.preset)
-    differ = None if options.clocks is None else options.clocks == "different"
-    reading = SourceOptions(
-        differ, options.flow, options.far_flow, options.sequence_at, options.bits, options.numbers,
-        period_ns(options.rate),
-    )  # fmt: skip
-    asked = MeasurementOptions(
-        time_s("--deadline", options.deadline),
-        tuple(map(share, options.share or ())) or QUANTILES,
-        options.window or WINDOWS,
-        time_s("--outage", options.outage),
-        time_s("--interval", options.interval),
-        time_s("--survival", options.survival),
-        options.within,
-    )
-    if len(paths) == 1 and is_iperf3_file(paths[0]):
-        needs_packets = ("deadline", "outage", "survival", "share", "window", "preset")
-        given = {f"--{name}": getattr(options, name) for name in needs_packets}
-        refuse(given, "needs packets; iperf3 counts per interval")
-        refuse_unused(reading, FILE_OPTIONS, "a report of iperf3")
-        return _print(iperf3_document(paths[0]), as_json=options.json)
-    if options.flows:
-        refuse({"--preset": preset}, "is of one flow; give --flow N in place of --flows")
-        return _print(flows_document(paths, reading, asked), as_json=options.json)
-    trace = read_files(paths, reading)
-    measurement = NetworkMeasurement(trace, asked, " ".join(options.sources), trace.notes)
-    _print(measurement_document(measurement), as_json=options.json)
+    given = vars(_parser().parse_args(arguments))
+    as_json: bool = given.pop("json")
+    name: str | None = given.pop("preset")
+    preset = None if name is None else preset_path(name)
+    measured = measure_sources(MeasureArguments(**given), {"--preset": name})
+    if isinstance(measured, Document):
+        return _print(measured, as_json=as_json)
+    _print(measurement_document(measured), as_json=as_json)
     if preset is not None:
-        written = write_preset(measurement, preset)
-        if not options.json:
+        written = write_preset(measured, preset)
+        if not as_json:
             print(f"written: {written}")
     return ExitStatus.OK
 

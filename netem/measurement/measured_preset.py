@@ -75,7 +75,7 @@ def measured_preset(measurement: NetworkMeasurement, name: str) -> Preset:
         name=name,
         sentence=f"Measured: {printable(measurement.name)}, {lost} lost{late}",
         forward=words,
-        fit=f"noack measure: {counted(count, 'packet')} in {measurement.observed_s:.1f} s; {model}{outages}; "
+        fit=f"measured: {counted(count, 'packet')} in {measurement.observed_s:.1f} s; {model}{outages}; "
         "quantiles of the delays with their correlation. All losses and delays of the measurement are in the "
         "forward direction, those of round trips, too. A model per packet: it assumes the measured rate.",
         source=PresetSource(title=printable(measurement.name)),
@@ -90,7 +90,7 @@ def write_preset(measurement: NetworkMeasurement, path: Path) -> Path:
         MachineError: the file cannot be written.
     """
     preset = measured_preset(measurement, path.stem)
-    note = f"# A preset: noack netem ... like {path if path.is_absolute() else f'./{path}'}\n"
+    note = f"# A preset: noack-netem ... like {path if path.is_absolute() else f'./{path}'}\n"
     return write_whole(path, note + preset_toml(preset))
 
 

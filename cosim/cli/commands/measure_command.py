@@ -1,5 +1,6 @@
 """``noack measure``: losses and delays of a real network."""
 
+from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -174,54 +175,45 @@ def measure(
     """
     from cosim.measurement.measurement_outputs import OutputRequest, write_outputs
     from cosim.measurement.run_trace import read_source
-    from netem.measurement.loss_bursts import WINDOWS
-    from netem.measurement.measure_options import period_ns, refuse, time_s
-    from netem.measurement.measure_options import share as as_share
+    from netem.measurement.measure_arguments import MeasureArguments, measure_sources
     from netem.measurement.measured_preset import preset_path
-    from netem.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
-    from netem.measurement.trace_sources import FILE_OPTIONS, SourceOptions, is_iperf3_file, refuse_unused
-    from netem.traces.packet_trace import find_trace
+    from netem.output.document import Document
 
-    options = MeasurementOptions(
-        time_s("--deadline", deadline),
-        tuple(map(as_share, share or ())) or QUANTILES,
-        window or WINDOWS,
-        time_s("--outage", outage),
-        time_s("--interval", interval),
-        time_s("--survival", survival),
-        within,
+    arguments = MeasureArguments(
+        sources=sources,
+        flow=flow,
+        flows=flows,
+        far_flow=far_flow,
+        sequence_at=sequence_at,
+        bits=bits,
+        numbers=numbers,
+        clocks=clocks,
+        rate=rate,
+        deadline=deadline,
+        share=share,
+        window=window,
+        outage=outage,
+        within=within,
+        interval=interval,
+        survival=survival,
     )
+    _ = arguments.reading, arguments.options  # a wrong option is reported before a scenario is loaded
     if settings and for_scenario is None:
         raise CallerError("--set: replaces a value of the scenario of --for; give one")
     scenario = None if for_scenario is None else opt.load_scenario(for_scenario, settings)
     if form is NetworkForm.MODEL and write is None:
         raise CallerError("--as model: is the form of --write; give its FILE.toml")
     preset_file = None if preset is None else preset_path(preset)
-    figures = requested_files(figure_format, width)
-    request = OutputRequest(out, figures, write, form.value, scenario, preset_file)
-    differ = None if clocks is None else clocks is ClockRelation.DIFFERENT
-    reading = SourceOptions(differ, flow, far_flow, sequence_at, bits, numbers, period_ns(rate))
-    paths = [*map(find_trace, sources)]
-    single = {"--for": for_scenario, "--out": out, "--write": write, "--preset": preset}
-    if len(paths) == 1 and is_iperf3_file(paths[0]):
-        from netem.measurement.iperf3_table import iperf3_document
-
-        needs_packets = {"--deadline": deadline, "--outage": outage, "--survival": survival, "--share": share}
-        refuse(single | needs_packets | {"--window": window}, "needs packets; iperf3 counts per interval")
-        refuse_unused(reading, FILE_OPTIONS, "a report of iperf3")
-        show(iperf3_document(paths[0]), json=json)
+    request = OutputRequest(
+        out, requested_files(figure_format, width), write, form.value, scenario, preset_file
+    )
+    of_one_flow = {"--for": for_scenario, "--out": out, "--write": write, "--preset": preset}
+    with status("measuring") if flows else nullcontext():
+        measured = measure_sources(arguments, of_one_flow, read_source)
+    if isinstance(measured, Document):
+        show(measured, json=json)
         return
-    if flows:
-        from netem.measurement.flow_table import flows_document
-
-        refuse(single, "is of one flow; give --flow N in place of --flows")
-        with status("measuring"):
-            document = flows_document(paths, reading, options)
-        show(document, json=json)
-        return
-    trace = read_source(paths, reading)
-    measurement = NetworkMeasurement(trace, options, " ".join(sources), trace.notes)
-    document, written = write_outputs(measurement, request)
+    document, written = write_outputs(measured, request)
     show(document, json=json, written=[str(path) for path in written])
     if not json:
         print(*(f"written: {path}" for path in written), sep="\n", end="\n" * bool(written))
