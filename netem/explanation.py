@@ -72,8 +72,8 @@ def explain(
             for spec in specs
         ]
         named = {"presets": [preset.content() for preset in presets]} if presets else {}
-        timed = {} if timetable is None else {"timetable": _timetable_document(timetable)}
-        print(json.dumps(named | {"links": links} | timed))
+        times = {} if timetable is None else {"timetable": _timetable_document(timetable)}
+        print(json.dumps(named | {"links": links} | times))
         return
     console = SafeConsole(highlight=False)
     for preset in presets:
@@ -90,7 +90,8 @@ def explain(
             _print_timetable(console, timetable, specs)
         if as_file:
             console.print(Text("\nas a file of links (--links)", "bold"))
-            toml = tomli_w.dumps({"link": [_link_table(written_spec)]}).strip()
+            timed = {} if timetable is None else _timetable_keys(timetable)
+            toml = tomli_w.dumps(timed | {"link": [_link_table(written_spec)]}).strip()
             console.print(Text(shortened(toml, _MAX_TOML)), soft_wrap=True)  # for copying
 
 
@@ -133,6 +134,13 @@ def _timetable_document(timetable: TimetableFile) -> dict[str, object]:
     }
 
 
+def _timetable_keys(timetable: TimetableFile) -> dict[str, object]:
+    """Return the keys of a timetable in a file of links."""
+    repeat_ns = timetable.repeat_ns
+    repeat = {} if repeat_ns is None else {"timetable_repeat_s": repeat_ns / NS_PER_S}
+    return {"timetable": str(timetable.path), **repeat}
+
+
 def _print_timetable(console: Console, timetable: TimetableFile, specs: Sequence[LinkSpec]) -> None:
     console.print(Text(f"\ntimetable {timetable.path}: {timetable.summary}", "bold"))
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="dim")
@@ -168,7 +176,7 @@ def settings_meaning(settings: LinkSettings) -> Iterator[tuple[str, str]]:
         yield constraint.text(), constraint.meaning()
     if settings.first_delivered:
         meaning = "the first packet of each flow is always delivered"
-        yield "first", f"{meaning}; the cap for later packets is mansd"
+        yield "first", f"{meaning}; mansd limits the losses of later packets"
     if any(impairment.delays for impairment in settings.impairments):
         most = settings.limit
         delayed = f"{most} packet is" if most == 1 else f"{most} packets are"
@@ -269,16 +277,18 @@ def order_meaning(settings: LinkSettings) -> str:
 
 def _print_bursts(console: Console, bursts: BurstPrediction, with_cap: float | None) -> None:
     if not bursts.chance:
-        console.print(Text(f"loss bursts without a cap: not known: {bursts.note}"))
+        console.print(Text(f"loss bursts without a guarantee: not known: {bursts.note}"))
         return
     if not any(bursts.chance.values()):
         return
     mean = f"{bursts.mean_burst:.3g} packets long on average" if bursts.mean_burst else "endless"
     behind = "" if with_cap is None else f"; with the guarantee {with_cap:.3g}"
-    console.print(Text(f"loss bursts without a cap: {mean}{behind}"))
-    console.print(Text(f"chance that within {bursts.packets} packets more are lost in a row, without a cap:"))
+    console.print(Text(f"loss bursts without a guarantee: {mean}{behind}"))
+    console.print(
+        Text(f"chance that within {bursts.packets} packets more than N are lost in a row, without a guarantee:")
+    )
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, show_header=False)
-    table.add_row("  lost in a row, more than", *map(str, bursts.chance))
+    table.add_row("  N", *map(str, bursts.chance))
     table.add_row("  chance", *map(chance_text, bursts.chance.values()))
     console.print(table)
 

@@ -8,6 +8,7 @@ as many as a test needs.
 import asyncio
 from collections.abc import Sequence
 from concurrent.futures import Future
+from os import PathLike
 from pathlib import Path
 from threading import Event, Thread
 from typing import Self
@@ -15,15 +16,18 @@ from typing import Self
 from netem.control.command_queue import CommandQueue, Snapshot
 from netem.control.emulator_statistics import DirectionStatistics, LinkStatistics, statistics
 from netem.core.address import Address, address_text, parse_address, parse_destination
+from netem.core.clock import NS_PER_S
 from netem.core.errors import CallerError, why
-from netem.core.number_checks import whole_number
+from netem.core.number_checks import real_number, whole_number
 from netem.core.settings_section import LARGEST_SEED
 from netem.impairments.link_settings import LinkSettings
 from netem.impairments.target_loss import read_files
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, Direction
+from netem.relay.timetable import Timetable
 from netem.tc_words import preset_names, reverse_words, settings_of
+from netem.timetable_file import SHORTEST_NS, read_timetable
 
 
 class LossyUdp:
@@ -32,7 +36,7 @@ class LossyUdp:
     Clients send to ``address`` instead of to the server. A datagram's fate depends on ``seed``,
     the direction, the number of the client (in the order in which clients appear) and the number of
     the datagram within its flow; so a program that sends the same datagrams meets the same losses
-    again, here, from ``noack netem`` and from a file of links. How many datagrams a program sends
+    again, here, from ``noack-netem`` and from a file of links. How many datagrams a program sends
     may depend on its timers.
 
     >>> import netem
@@ -50,9 +54,13 @@ class LossyUdp:
         seed: seed of the random streams.
         listen: where clients send to; port 0 selects a free port.
         name: name of the link in reports.
+        timetable: a CSV file with changes of the settings, in seconds since the start, as that of
+            ``noack-netem --timetable``.
+        repeat_s: the timetable repeats after this time in seconds; by default it does not.
 
     Raises:
-        CallerError: an address or a word is wrong; the listening address is in use (on entering).
+        CallerError: an address, a word or the timetable is wrong; the listening address is in use
+            (on entering).
     """
 
     def __init__(
@@ -64,6 +72,8 @@ class LossyUdp:
         seed: int = 0,
         listen: str | Sequence[str | int] = "127.0.0.1:0",
         name: str = "relay",
+        timetable: str | PathLike[str] | None = None,
+        repeat_s: float | None = None,
     ) -> None:
         seed = whole_number("seed", seed, 0, LARGEST_SEED)
         listen_at = parse_address(_text(listen, "listen"), "listen")
@@ -72,6 +82,7 @@ class LossyUdp:
         answers = reverse_words(preset_names(words)) if reverse is None else reverse
         reverse_settings = _settings(answers, "reverse", "reverse")
         self._spec = LinkSpec(name, listen_at, server, forward_settings, reverse_settings, seed)
+        self._timetable = self._read_timetable(timetable, repeat_s)
         self._opening: Future[tuple[CommandQueue, Address]] = Future()
         self._last_snapshot: Snapshot | None = None
         self._stop = Event()
@@ -161,10 +172,24 @@ class LossyUdp:
             raise CallerError(f"{self._spec.name}: not entered; with noack.LossyUdp(...) as link:")
         return self._opening.result()
 
+    def _read_timetable(self, path: str | PathLike[str] | None, repeat_s: float | None) -> Timetable | None:
+        if path is None:
+            if repeat_s is not None:
+                raise CallerError(f"repeat_s: {repeat_s!r}; there is no timetable")
+            return None
+        if not isinstance(path, str | PathLike):
+            raise CallerError(f"timetable: {path!r}; give the name of a CSV file")
+        repeat_ns = None
+        if repeat_s is not None:
+            repeat_ns = round(real_number("repeat_s", repeat_s, above=0, most=1e6) * NS_PER_S)
+            if repeat_ns < SHORTEST_NS:
+                raise CallerError(f"repeat_s {repeat_s:g}: must be 0.001 s or more")
+        return read_timetable(Path(path), [self._spec], repeat_ns).timetable
+
     def _run(self) -> None:
         """Relay until the context ends; all of the relay is used in this thread."""
         try:
-            relay = Relay([self._spec])
+            relay = Relay([self._spec], timetable=self._timetable)
         except OSError as error:  # e.g. too many open files
             self._opening.set_exception(CallerError(f"{self._spec.name}: {why(error)}"))
             return

@@ -65,11 +65,16 @@ def lossy_udp(request: pytest.FixtureRequest) -> Iterator[Callable[..., LossyUdp
             reverse: str | None = None,
             seed: int | None = None,
             listen: str | Sequence[str | int] = "127.0.0.1:0",
+            timetable: str | os.PathLike[str] | None = None,
+            repeat_s: float | None = None,
         ) -> LossyUdp:
             # Each link has a seed of its own, so that links with the same words differ.
             link_seed = (common + len(links)) % 2**64 if seed is None else seed
             name = f"link {len(links) + 1}"
-            link = LossyUdp(to, words, reverse=reverse, seed=link_seed, listen=listen, name=name)
+            link = LossyUdp(
+                to, words, reverse=reverse, seed=link_seed, listen=listen, name=name,
+                timetable=timetable, repeat_s=repeat_s,
+            )  # fmt: skip
             links.append(stack.enter_context(link))
             return link
 
@@ -83,9 +88,9 @@ def pytest_runtest_makereport(
     """Report which network a failed test had, and how to have it again."""
     report = yield
     if report.failed and (links := item.stash.get(_LINKS, [])):
-        command = (
-            f"the same losses again: pytest {_OPTION} {item.config.stash[_COMMON]} {shlex.quote(item.nodeid)}"
-        )
+        file, colons, name = item.nodeid.partition("::")  # of the root folder, which may be another
+        test = os.path.relpath(item.config.rootpath / file, item.config.invocation_params.dir) + colons + name
+        command = f"the same losses again: pytest {_OPTION} {item.config.stash[_COMMON]} {shlex.quote(test)}"
         text = "\n".join([*map(str, links), command])
         add = getattr(report.longrepr, "addsection", None)  # shown whatever --show-capture is
         if add is not None:

@@ -3,7 +3,7 @@
     time_s,words
     0,delay 20ms
     10,loss burst 30% 5 delay 80ms 20ms
-    12.5,"blackout 0s-1h"
+    12.5,"blackout 0s-3600s"
 
 Its header names the columns: ``time_s`` (seconds since the start), ``words`` (as of ``noack netem
 set``: they replace all settings of the direction), and if needed ``direction`` (forward, reverse or

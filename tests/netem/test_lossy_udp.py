@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-import noack
+import netem
 from netem import pytest_plugin
 from netem.core.errors import NoackError
 from netem.link_state import LinkState
@@ -36,7 +36,7 @@ class Ends:
         for end in (self.server, self.client):
             end.settimeout(PATIENCE_S)
 
-    def send(self, link: noack.LossyUdp, numbers: range) -> None:
+    def send(self, link: netem.LossyUdp, numbers: range) -> None:
         for number in numbers:
             self.client.sendto(number.to_bytes(4), link.address)
 
@@ -58,7 +58,7 @@ def intact(counts: dict[str, int]) -> int:
 
 def arrived(ends: Ends, words: str, seed: int, count: int = 300) -> list[bool]:
     """Return which of the datagrams arrive, by the receiver."""
-    with noack.LossyUdp(ends.server.getsockname(), words, seed=seed) as link:
+    with netem.LossyUdp(ends.server.getsockname(), words, seed=seed) as link:
         ends.send(link, range(count))
         wait_for(lambda: link.forward["received"] == count)
         received = ends.received(intact(link.forward["fates"]))
@@ -79,7 +79,7 @@ def test_the_losses_are_those_of_the_seed_and_of_the_rules(ends: Ends) -> None:
 
 
 def test_a_change_does_not_reset_the_guarantee(ends: Ends) -> None:
-    with noack.LossyUdp(ends.server.getsockname(), "loss 100% mansd 3") as link:
+    with netem.LossyUdp(ends.server.getsockname(), "loss 100% mansd 3") as link:
         count = 0
         for _ in range(20):  # each change would allow three more losses if it forgot the others
             ends.send(link, range(count, count := count + 2))
@@ -99,7 +99,7 @@ def test_a_change_does_not_reset_the_guarantee(ends: Ends) -> None:
 ])  # fmt: skip
 def test_a_mistake_is_one_line(arguments: tuple[str, ...], message: str) -> None:
     with pytest.raises(NoackError) as error:
-        noack.LossyUdp(*arguments)
+        netem.LossyUdp(*arguments)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -110,6 +110,40 @@ def run_pytest(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str
         [sys.executable, "-m", "pytest", *plugin, "-p", "no:cacheprovider", *arguments],
         cwd=folder, capture_output=True, text=True, check=False,
     )  # fmt: skip
+
+
+def test_a_timetable_changes_the_settings(ends: Ends, tmp_path: Path) -> None:
+    """Its times are since the start: the first line applies to the first datagram."""
+    path = tmp_path / "tunnel.csv"
+    path.write_text("time_s,words\n0,blackout 0s-3600s\n86400,loss none\n")
+    with netem.LossyUdp(ends.server.getsockname(), timetable=path, repeat_s=90_000) as link:
+        ends.send(link, range(5))
+        wait_for(lambda: link.forward["fates"].get("blacked_out") == 5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ({"timetable": "gone.csv"}, "gone.csv: cannot be read: No such file or directory"),
+        ({"timetable": 5}, "timetable: 5; give the name of a CSV file"),
+        ({"repeat_s": 5}, "repeat_s: 5; there is no timetable"),
+        ({"timetable": "t.csv", "repeat_s": 0}, "repeat_s 0: expected more than 0"),
+        ({"timetable": "t.csv", "repeat_s": 1e-6}, "repeat_s 1e-06: must be 0.001 s or more"),
+        (
+            {"timetable": "t.csv", "repeat_s": 2},
+            "t.csv: line 3: time_s is 5, but the timetable repeats every 2 s; repeat it later, or leave "
+            "the line out",
+        ),
+    ],
+)
+def test_a_wrong_timetable_is_refused(
+    arguments: dict[str, Any], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("t.csv").write_text("time_s,words\n1,loss 5%\n5,loss none\n")
+    with pytest.raises(NoackError) as error:
+        netem.LossyUdp("127.0.0.1:9", **arguments)
+    assert str(error.value) == line
 
 
 FAILS = """
@@ -143,6 +177,18 @@ def test_a_failure_names_the_seed_that_repeats_it(tmp_path: Path) -> None:
     (tmp_path / "test_it.py").write_text(FAILS)
     first = failure(run_pytest(tmp_path, "-vv"))
     assert failure(run_pytest(tmp_path, "-vv", "--noack-seed", first[1])) == first
+
+
+def test_the_command_that_repeats_a_failure_names_the_test_from_where_pytest_runs(tmp_path: Path) -> None:
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    folder = tmp_path / "below"
+    folder.mkdir()
+    (folder / "test_it.py").write_text(
+        'def test_it(lossy_udp):\n    lossy_udp("127.0.0.1:9", timetable="t.csv")\n    raise ValueError\n'
+    )
+    (folder / "t.csv").write_text("time_s,words\n0,loss 5%\n")
+    run = run_pytest(folder)
+    assert run.stdout.count(" test_it.py::test_it\n") == 1, run.stdout
 
 
 def test_the_seed_is_that_of_the_option_the_environment_or_the_file(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ from netem.__main__ import main
 from netem.core.clock import NS_PER_S
 from netem.emulator_options import command_line_parser, parse_options, specs_of, timetable_of
 from netem.impairments.link_settings import LinkSettings
+from netem.links_file import load_links, load_timetable
 from netem.relay.relay_links import LinkSpec
 from netem.relay.timetable import TimedChange
 from netem.tc_words import settings_of
@@ -125,7 +126,7 @@ def test_a_mistake_on_the_command_line_is_one_line(
     Path("links.toml").write_text(LINKS_TOML)
     Path("drive.csv").write_text("time_s,words\n0,loss 5%\n")
     assert main(["--explain", *arguments]) == 2
-    assert capsys.readouterr().err == f"noack netem: {line}\n"
+    assert capsys.readouterr().err == f"noack-netem: {line}\n"
 
 
 def test_an_explanation_shows_the_timetable(
@@ -138,7 +139,7 @@ def test_an_explanation_shows_the_timetable(
     arguments = ["--explain", "mansd", "4", "--timetable", "drive.csv", "--repeat", "60s"]
     assert main(arguments) == 0
     text = capsys.readouterr().out
-    timetable, _, _ = text[text.index("timetable") :].partition("as a file")
+    timetable, _, file = text[text.index("timetable") :].partition("as a file of links (--links)\n")
     shown = [" ".join(line.split()) for line in timetable.splitlines()]
     assert shown[:4] == [
         "timetable drive.csv: 59 changes of settings, the last at 59 s, repeated every 60 s",
@@ -147,6 +148,10 @@ def test_an_explanation_shows_the_timetable(
         "2 s forward loss 10% mansd 1 9.091%",
     ]
     assert "and 8 further lines; --json has all" in shown
+    Path("links.toml").write_text(file)
+    options = parse_options(command_line_parser(), arguments)
+    from_file = load_timetable(Path("links.toml"), load_links(Path("links.toml")))
+    assert from_file == timetable_of(options, specs_of(options))
     assert "drive.csv: line 2: forward no longer has mansd 4; the words replace all settings" in shown
     assert main([*arguments, "--json"]) == 0
     timetable = json.loads(capsys.readouterr().out)["timetable"]
