@@ -13,7 +13,7 @@ from typing import NoReturn
 from netem.core.command_line import stoppable_imports
 
 with stoppable_imports():
-    from netem.core.command_line import Parser, report_failure, why_not_written
+    from netem.core.command_line import Parser, netem_program, report_failure, why_not_written
     from netem.core.errors import CallerError, ExitStatus, NoackError
     from netem.core.standard_streams import guard_streams
     from netem.core.system_processes import exhausted_limit
@@ -52,10 +52,10 @@ def main(arguments: Sequence[str] | None = None, parser: Parser | None = None) -
             sys.stdout.flush()
         return status
     except NoackError as error:
-        return report_failure(str(error), error.exit_status, source="noack netem", as_json=as_json)
+        return report_failure(str(error), error.exit_status, source=netem_program(), as_json=as_json)
     except OSError as error:
         reason = exhausted_limit(error) or why_not_written(error) or str(error)
-        return report_failure(reason, ExitStatus.FAILED, source="noack netem", as_json=as_json)
+        return report_failure(reason, ExitStatus.FAILED, source=netem_program(), as_json=as_json)
 
 
 def _measure(words: Sequence[str]) -> ExitStatus:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from netem.core.address import parse_address, parse_destination
 from netem.core.clock import NS_PER_S
-from netem.core.command_line import Parser
+from netem.core.command_line import Parser, netem_program
 from netem.core.errors import CallerError
 from netem.core.number_checks import whole_number
 from netem.core.settings_section import LARGEST_SEED
@@ -34,7 +34,7 @@ from netem.timetable_file import SHORTEST_NS, TimetableFile, read_timetable
 LINK_NAME = "relay"
 """Name of the link that the command line describes."""
 
-_COMMANDS = ("show", "set", "watch", "shell")
+_COMMANDS = ("show", "set", "watch", "shell", "measure")
 _EXAMPLE_LISTEN, _EXAMPLE_TO = ":9000", ":9001"
 """Addresses for --explain."""
 
@@ -47,9 +47,9 @@ other networks; --outside starts servers in it.
 exit status: the command's; 2 a mistake, or the system does not permit it; 143 ended by a signal
 
 examples:
-  noack netem shell loss 30% mansd 4 delay 20ms -- ping -c 10 198.18.16.1
-  noack netem shell --both delay 20ms rate 8mbit -- bash
-  noack netem shell loss 5% --outside "iperf3 -s" -- sh -c "sleep 1; iperf3 -c 198.18.16.1"
+  {program} shell loss 30% mansd 4 delay 20ms -- ping -c 10 198.18.16.1
+  {program} shell --both delay 20ms rate 8mbit -- bash
+  {program} shell loss 5% --outside "iperf3 -s" -- sh -c "sleep 1; iperf3 -c 198.18.16.1"
 """
 _EPILOG = """
 words, in the order in which they apply; T is a time (10ms), P a percentage (5%), N a number:
@@ -69,11 +69,12 @@ settings, at any place:
 A flow is the datagrams from one client (address and port), or the answers to it.
 
 commands for an emulator that runs with --control NAME (each has --help):
-  noack netem show [NAME]         show its statistics
-  noack netem set [NAME] WORDS    change its impairments
-  noack netem watch [NAME]        show its statistics live
+  {program} show [NAME]         show its statistics
+  {program} set [NAME] WORDS    change its impairments
+  {program} watch [NAME]        show its statistics live
 
-`noack netem shell --help` is about commands all of whose packets pass the emulator.
+`{program} shell --help` is about commands all of whose packets pass the emulator,
+`{program} measure --help` about networks measured from captures and logs.
 
 When the emulator is ready, it prints a line on standard output:
   ready: listening on 127.0.0.1:9000
@@ -82,11 +83,11 @@ exit status: 0 ended as requested; 1 a failure; 2 a mistake on the command line 
 3 unintended losses (a full buffer or queue): the guarantee does not hold
 
 examples:
-  noack netem --listen :9000 --to :9001 loss 5% mansd 4
-  noack netem --listen :9000 --to :9001 delay 10ms 2ms distribution normal --reverse delay 10ms
-  noack netem --listen :5300 --to 192.0.2.1:53 --both "loss gemodel 1% 10%"
-  noack netem --links links.toml
-  noack netem --explain loss burst 5% 3 mansd 2
+  {program} --listen :9000 --to :9001 loss 5% mansd 4
+  {program} --listen :9000 --to :9001 delay 10ms 2ms distribution normal --reverse delay 10ms
+  {program} --listen :5300 --to 192.0.2.1:53 --both "loss gemodel 1% 10%"
+  {program} --links links.toml
+  {program} --explain loss burst 5% 3 mansd 2
 """
 
 
@@ -115,17 +116,18 @@ class _Formatter(argparse.HelpFormatter):
 def command_line_parser() -> Parser:
     """Return the parser of the command line."""
     parser = Parser(
-        prog="noack netem",
+        prog=netem_program(),
         usage="%(prog)s --listen HOST:PORT --to HOST:PORT\n"
         "                   [WORDS ...] [options]\n"
         "       %(prog)s --links FILE.toml [options]\n"
         "       %(prog)s --explain WORDS ...\n"
         "       %(prog)s --presets\n"
         "       %(prog)s shell [WORDS ...] [options] [-- COMMAND]\n"
-        "       %(prog)s show|set|watch [NAME] ...",
+        "       %(prog)s show|set|watch [NAME] ...\n"
+        "       %(prog)s measure FILE ...",
         description="A UDP relay that emulates a network, configured in the syntax of `tc netem`. "
         "With mansd N, at most N consecutive datagrams of a flow are lost.",
-        epilog=_EPILOG.format(grammar="\n  ".join(GRAMMAR)),
+        epilog=_EPILOG.format(grammar="\n  ".join(GRAMMAR), program=netem_program()),
         formatter_class=_Formatter,
         allow_abbrev=False,
     )
@@ -159,13 +161,13 @@ def command_line_parser() -> Parser:
 def shell_parser() -> Parser:
     """Return the parser of the command line of a shell, without its command."""
     parser = Parser(
-        prog="noack netem shell",
+        prog=f"{netem_program()} shell",
         usage="%(prog)s [WORDS ...] [options] [-- COMMAND]",
         description="Run a command (without one: your shell) in a network namespace, and pass all "
-        "its IP packets through an emulated network. The words are those of `noack netem`. "
+        f"its IP packets through an emulated network. The words are those of `{netem_program()}`. "
         "With mansd N, at most N consecutive packets of a flow (protocol, addresses and ports) "
         "are lost. It needs no root if the kernel permits user namespaces.",
-        epilog=_SHELL_EPILOG,
+        epilog=_SHELL_EPILOG.format(program=netem_program()),
         formatter_class=_Formatter,
         allow_abbrev=False,
     )
@@ -235,7 +237,7 @@ def specs_of(options: argparse.Namespace, *, read: bool = True) -> tuple[LinkSpe
         options.to = options.to or _EXAMPLE_TO
     if options.listen is None and options.to is None:
         _require_word(options.words)
-        raise CallerError("an emulator on its own needs --listen and --to, or --links; see --help")
+        raise CallerError("--listen and --to are missing, or --links FILE; see --help")
     if options.listen is None or options.to is None:
         raise CallerError("--listen and --to must be given together")
     listen = parse_address(options.listen, "--listen")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from netem.control.command_queue import CommandQueue
 from netem.control.emulator_statistics import Statistics, StatisticsThread
-from netem.core.command_line import LogFormat, discard_output
+from netem.core.command_line import LogFormat, discard_output, netem_program
 from netem.core.errors import CallerError, why
 from netem.core.file_access import open_growing
 from netem.relay.relay import Relay
@@ -31,7 +31,9 @@ _SWITCH_S = 0.0002
 def add_watching_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for what watches and changes a relay while it runs."""
     group = parser.add_argument_group("statistics and changes during operation")
-    group.add_argument("--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`, and HTTP")
+    group.add_argument(
+        "--control", metavar="NAME", help=f"accept `{netem_program()} show|set|watch NAME`, and HTTP"
+    )
     group.add_argument(
         "--control-port",
         metavar="PORT",

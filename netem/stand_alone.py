@@ -17,7 +17,7 @@ from netem.control.emulator_statistics import Statistics, statistics, unintended
 from netem.control.running_emulators import starting
 from netem.control.statistics_text import statistics_lines
 from netem.core.address import address_text
-from netem.core.command_line import Parser, Signals, log_event, log_format, report_failure
+from netem.core.command_line import Parser, Signals, log_event, log_format, netem_program, report_failure
 from netem.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from netem.core.number_format import counted
 from netem.core.realtime_settings import realtime
@@ -109,7 +109,7 @@ def run_stand_alone(arguments: Sequence[str], parser: Parser | None = None) -> E
         try:
             totals = run_relay(specs, options, timetable=timetable)
         except NoackError as error:  # reported in the format of the log
-            return report_failure(str(error), error.exit_status, source="noack netem", as_json=options.json)
+            return report_failure(str(error), error.exit_status, source=netem_program(), as_json=options.json)
         report_totals(totals, options)
     return ExitStatus.UNINTENDED_LOSSES if unintended_losses(totals) else ExitStatus.OK
 
@@ -118,7 +118,7 @@ def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
     """Print the totals of a relay that has ended."""
     if options.json:
         print(json.dumps(totals))
-    logged = log_event("info", "noack netem", "ended", event="totals", totals=totals)
+    logged = log_event("info", netem_program(), "ended", event="totals", totals=totals)
     if not (options.json or logged):
         for line in statistics_lines(totals):
             print(line, file=sys.stderr)

@@ -65,6 +65,7 @@ def _netem_help() -> str:
     output = io.StringIO()
     with (
         patch.dict(os.environ, COLUMNS="100"),
+        patch("sys.argv", ["noack"]),
         contextlib.redirect_stdout(output),
         contextlib.suppress(SystemExit),
     ):

@@ -18,6 +18,7 @@ from netem.control.emulator_statistics import Statistics
 from netem.control.metrics_text import METRICS_TYPE, metrics_text
 from netem.core import toml_file
 from netem.core.address import address_text
+from netem.core.command_line import netem_program
 from netem.core.errors import CallerError, NoackError, printable, shortened, with_short_words
 from netem.core.json_text import parse_json
 from netem.core.settings_section import ScenarioSection
@@ -224,5 +225,5 @@ def _require_read(settings: LinkSettings, source: str) -> None:
         if file is not None:
             raise CallerError(
                 f"{source}: {file}: files are not read here; send the content as a table, "
-                "or use `noack netem set`"
+                f"or use `{netem_program()} set`"
             )

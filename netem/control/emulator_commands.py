@@ -12,7 +12,7 @@ from netem.control.control_client import Client
 from netem.control.emulator_statistics import Statistics
 from netem.control.running_emulators import find_emulator, running_emulators
 from netem.control.statistics_text import statistics_lines
-from netem.core.command_line import Parser, Signals, discard_output, report_failure
+from netem.core.command_line import Parser, Signals, discard_output, netem_program, report_failure
 from netem.core.errors import CallerError, ExitStatus, NoackError, why
 from netem.impairments.link_settings import LinkSettings
 from netem.impairments.target_loss import read_files
@@ -28,7 +28,7 @@ def main(arguments: Sequence[str]) -> ExitStatus:
     try:
         return COMMANDS[command](options)
     except NoackError as error:
-        source, as_json = f"noack netem {command}", "--json" in options
+        source, as_json = f"{netem_program()} {command}", "--json" in options
         return report_failure(str(error), error.exit_status, source=source, as_json=as_json)
     except BrokenPipeError:  # the reader has closed the pipe
         discard_output(sys.stdout.fileno())
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str]) -> ExitStatus:
     except OSError as error:
         reason = f"cannot write: {why(error)}"
         return report_failure(
-            reason, ExitStatus.FAILED, source=f"noack netem {command}", as_json="--json" in options
+            reason, ExitStatus.FAILED, source=f"{netem_program()} {command}", as_json="--json" in options
         )
 
 
@@ -44,9 +44,9 @@ def _parser(
     command: str, description: str, examples: Sequence[str], json_help: str, **options: Any
 ) -> Parser:
     parser = Parser(
-        prog=f"noack netem {command}",
+        prog=f"{netem_program()} {command}",
         description=description,
-        epilog="\n  ".join(["examples:", *examples]),
+        epilog="\n  ".join(["examples:", *(f"{netem_program()} {line}" for line in examples)]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         **options,
     )
@@ -66,7 +66,7 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
     parser = _parser(
         "show",
         "Show the statistics of a running emulator.",
-        ("noack netem show", "noack netem show dns --json"),
+        ("show", "show dns --json"),
         "print one JSON document",
     )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
@@ -84,7 +84,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
         "set",
         "Change the impairments of a link of a running emulator. The words replace all settings\n"
         "of the direction, the cap too, as with `tc qdisc change`.",
-        ("noack netem set loss 10% mansd 4", "noack netem set dns --direction both delay 20ms 5ms"),
+        ("set loss 10% mansd 4", "set dns --direction both delay 20ms 5ms"),
         "print the links' settings as JSON",
         usage="%(prog)s [NAME] [--link LINK] [--direction forward|reverse|both] WORDS ...",
     )
@@ -133,7 +133,7 @@ def _warn_of_removed_caps(earlier: Sequence[Mapping[str, Any]], later: Sequence[
             kept_names = {words.partition(" ")[0] for words in words_after}
             if removed := [words for words in words_before if words.partition(" ")[0] not in kept_names]:
                 print(
-                    f"noack netem set: {new['name']} {direction} no longer has "
+                    f"{netem_program()} set: {new['name']} {direction} no longer has "
                     f"{', '.join(removed)}; the words replaced all settings",
                     file=sys.stderr,
                     flush=True,
@@ -164,7 +164,7 @@ def _watch(arguments: Sequence[str]) -> ExitStatus:
         "watch",
         "Print a running emulator's statistics every second: a line for each direction of a link\n"
         "that has received datagrams.",
-        ("noack netem watch", "noack netem watch dns --json"),
+        ("watch", "watch dns --json"),
         "print one JSON document per second",
     )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)

@@ -75,7 +75,7 @@ class TokenCheck:
         return error_answer(
             HTTPStatus.UNAUTHORIZED,
             f"header Authorization: {problem}; expected Bearer TOKEN, with the token of this port",
-            ("WWW-Authenticate", 'Bearer realm="noack netem"'),
+            ("WWW-Authenticate", 'Bearer realm="noack-netem"'),
         )
 
 

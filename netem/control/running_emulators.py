@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from netem.core import private_folder
+from netem.core.command_line import netem_program
 from netem.core.errors import CallerError, PeerError
 from netem.core.private_folder import require_name
 
@@ -102,7 +103,7 @@ def find_emulator(name: str | None) -> str:
     if not files:
         name_text = "" if name is None else f" {name!r}"
         raise CallerError(
-            f"no emulator{name_text} accepts commands; start one with `noack netem --control NAME …`"
+            f"no emulator{name_text} accepts commands; start one with `{netem_program()} --control NAME …`"
         )
     if name is None and len(files) > 1:
         raise CallerError(f"which emulator? Running: {', '.join(files)}")

@@ -1,7 +1,7 @@
 """Shared by all programs of noack: errors as text and JSON, JSON Lines on standard error, signals.
 
 As JSON Lines, for log collectors, each line of text is an object with ``time`` (UTC), ``level``
-(info, warning, error), ``source`` (the program, e.g. ``noack netem``) and ``message``. An event has
+(info, warning, error), ``source`` (the program, e.g. ``noack-netem``) and ``message``. An event has
 also its name, ``event``, and its numbers.
 
 A signal that ends a program is a flag that loops poll, an error elsewhere, an exit in the imports.
@@ -32,7 +32,7 @@ from netem.core.errors import CallerError, ExitStatus, MachineError, printable, 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-_LINE = re.compile(r"(?P<source>noack(?: [a-z]+)?): (?P<warning>warning: )?(?P<message>.*)")
+_LINE = re.compile(r"(?P<source>noack(?:[ -][a-z]+)*): (?P<warning>warning: )?(?P<message>.*)")
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 _ECHO_NS = 500_000_000  # a parent may pass on a signal that the process group has received already
 _HANGUP: int | None = getattr(signal, "SIGHUP", None)  # not on Windows
@@ -44,6 +44,15 @@ if _HANGUP:
     _ENDING[_HANGUP] = ExitStatus.TERMINATED, "stopped because the terminal was closed"
 END_SIGNALS = tuple(signal.Signals(number).name for number in _ENDING)
 """Names of the signals that end a program."""
+
+
+def netem_program() -> str:
+    """Return how the user of this process calls the emulator: by its own command, or that of noack."""
+    return "noack netem" if _program() == "noack" else "noack-netem"
+
+
+def _program() -> str:
+    return Path(sys.argv[0]).name if sys.argv else ""
 
 
 class LogFormat(StrEnum):
@@ -187,7 +196,7 @@ class Parser(argparse.ArgumentParser):
 def report_failure(message: str, status: ExitStatus, *, source: str, as_json: bool) -> ExitStatus:
     """Print why a command failed, one line per mistake, and return its exit status.
 
-    Each line begins with ``source``, such as ``noack netem``. With ``as_json`` a JSON document is
+    Each line begins with ``source``, such as ``noack-netem``. With ``as_json`` a JSON document is
     also printed to standard output. Very long words, which the message quotes, are cut off.
     """
     message = with_short_words(message)
@@ -319,7 +328,8 @@ def _ignore_signals() -> None:
 
 def _end_at_once(number: int, _frame: FrameType | None) -> None:
     with suppress(OSError):  # standard error may be closed or full
-        os.write(2, f"noack: {stop_reason(number)}\n".encode())
+        program = "noack-netem" if _program() == "noack-netem" else "noack"
+        os.write(2, f"{program}: {stop_reason(number)}\n".encode())
     os._exit(_ENDING[number][0])
 
 

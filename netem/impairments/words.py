@@ -306,7 +306,7 @@ class WordReader:
         """Raise a CallerError for an unknown word; name the nearest known word."""
         longer = sorted(name for name in known_words if name.startswith(word))
         if longer:
-            self.wrong(f"words are not shortened; did you mean {' or '.join(longer)}?")
+            self.wrong(f"no such word, and words are not shortened; did you mean {' or '.join(longer)}?")
         close = difflib.get_close_matches(word, known_words, n=1, cutoff=0.5)
         hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known_words)}"
         self.wrong(f"no such word; {hint}")

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from netem.core import toml_file
+from netem.core.command_line import netem_program
 from netem.core.errors import CallerError, printable, shortened
 from netem.core.settings_section import FolderName, NonNegative, Positive, Probability, ScenarioSection
 
@@ -127,7 +128,7 @@ def find_preset(name: str, folder: Path = Path()) -> Preset:
         return shipped[name]
     near = [known for known in shipped if name and (known.startswith(name) or name in known)]
     near = near or difflib.get_close_matches(name, shipped, n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(near[:3])}?" if near else "noack netem --presets lists them"
+    hint = f"did you mean {' or '.join(near[:3])}?" if near else f"{netem_program()} --presets lists them"
     if "/" in name:
         hint = f"the name of a preset's file ends in {SUFFIX}"
     raise CallerError(f"no preset {shortened(printable(name))}; {hint}")

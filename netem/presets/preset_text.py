@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from netem.core.command_line import netem_program
 from netem.core.console import SafeConsole
 from netem.core.errors import shortened
 from netem.presets.preset import Preset
@@ -28,7 +29,9 @@ def print_list(presets: Iterable[Preset], *, as_json: bool) -> None:
         lines = (f"{key}: {value}" for key, value in _rows(preset, _LONGEST_WORDS))
         table.add_row(preset.name, Text("\n".join((preset.sentence, *lines))))
     console.print(table)
-    console.print(Text("\nTo use one: like NAME; to see all its words: noack netem --explain like NAME"))
+    console.print(
+        Text(f"\nTo use one: like NAME; to see all its words: {netem_program()} --explain like NAME")
+    )
 
 
 def print_explanation(console: Console, preset: Preset) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.core.address import Address
-from netem.core.command_line import print_to_stderr
+from netem.core.command_line import netem_program, print_to_stderr
 from netem.impairments.link_settings import Counters, LinkSettings
 
 Bytes = NDArray[np.uint8]
@@ -28,7 +28,7 @@ _JOINED = 8
 
 def report_line(line: str) -> None:
     """Write a line; if standard error is closed, the emulator continues."""
-    print_to_stderr(f"noack netem: {line}")
+    print_to_stderr(f"{netem_program()}: {line}")
 
 
 class FlowReport(NamedTuple):

@@ -159,7 +159,7 @@ def guard(parent: int, namespace: int, command: list[str]) -> int:
         try:
             os.execvp(command[0], command)
         except OSError as error:
-            os.write(2, f"noack netem: {command[0]}: {error.strerror}\n".encode())
+            os.write(2, f"noack-netem: {command[0]}: {error.strerror}\n".encode())
             os._exit(NOT_FOUND)
     # Wait for the command's end, a signal, or the parent's end.
     status = None

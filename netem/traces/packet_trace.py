@@ -137,7 +137,7 @@ def packet_trace(
     received = np.where(lost, sent, received)
     early = (
         "is received before it is sent; if two clocks were read, give --clocks different "
-        "(noack measure), relative (noack netem), clocks_differ = true (TOML)"
+        "(measure), relative (words), clocks_differ = true (TOML)"
     )
     _refuse(np.flatnonzero(received < sent), row, early)
     return _with_missing(number, sent, np.where(lost, LOST_NS, received))

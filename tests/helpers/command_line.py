@@ -23,4 +23,5 @@ def invoke(*words: object) -> Result:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(line_times, "LINE_EVERY_S", _NEVER_S)
         patch.setattr(line_times, "FIRST_LINE_S", _NEVER_S)
+        patch.setattr("sys.argv", ["noack", *map(str, words)])
         return CliRunner().invoke(app, [str(word) for word in words], prog_name="noack")

@@ -116,7 +116,7 @@ def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFi
 
         assert emulator_commands.main(["set", "lab", "loss 5%"]) == ExitStatus.OK
         assert capsys.readouterr().err == (
-            "noack netem set: relay forward no longer has mansd 2; the words replaced all settings\n"
+            "noack-netem set: relay forward no longer has mansd 2; the words replaced all settings\n"
         )
         emulator.finish()
     assert running_emulators() == []

@@ -73,8 +73,8 @@ def test_the_examples_of_the_help_are_valid(
     examples = text.replace("\\\n", "").splitlines()
     assert len(examples) == 5
     for line in examples:
-        assert line.startswith("  noack netem ")
-        assert specs(line.removeprefix("  noack netem "))
+        assert line.startswith("  noack-netem ")
+        assert specs(line.removeprefix("  noack-netem "))
 
 
 def test_every_word_is_in_the_help_and_has_an_example() -> None:

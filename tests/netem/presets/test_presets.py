@@ -138,7 +138,7 @@ def test_a_file_of_links_has_presets_and_those_of_its_folder(tmp_path: Path) -> 
     assert words_of(both.reverse) == "loss 2%"
     assert words_of(one_way.reverse) == ""
     links.write_text(link.format("a", "like zebra"))
-    message = 'link.0.forward = "like zebra": like zebra: no preset zebra; noack netem --presets lists them'
+    message = 'link.0.forward = "like zebra": like zebra: no preset zebra; noack-netem --presets lists them'
     with pytest.raises(CallerError) as error:
         load_links(links)
     assert str(error.value) == f"{links}: {message}"
@@ -164,7 +164,7 @@ def test_a_link_within_a_program_has_presets(monkeypatch: pytest.MonkeyPatch, tm
         ("star-link", "no preset star-link; did you mean starlink?"),
         ("5g", "no preset 5g; did you mean 5g-arterial or 5g-rural or 5g-urban?"),
         ("wifi", "no preset wifi; did you mean wifi-busy or wifi-campus?"),
-        ("zebra", "no preset zebra; noack netem --presets lists them"),
+        ("zebra", "no preset zebra; noack-netem --presets lists them"),
         ("./office", "no preset ./office; the name of a preset's file ends in .toml"),
         ("absent.toml", "absent.toml: no such file"),
     ],

@@ -138,7 +138,7 @@ def test_an_absent_server_is_reported_and_causes_no_later_loss(
     assert report.forward.unintended == {"lost_in_kernel": 0}
     assert report.port_unreachable > 0
     assert capfd.readouterr().err == (
-        f"noack netem: link test: nothing listens on {address[0]}:{address[1]} "
+        f"noack-netem: link test: nothing listens on {address[0]}:{address[1]} "
         "(ICMP port unreachable); what is sent there is lost\n"
     )
 

@@ -18,7 +18,7 @@ ALONE = (
         ("--session x loss 5%", f"--session {ALONE}"),
         ("--session=x --stats 1", f"--session {ALONE}"),
         ("--credentials folder --listen :9000 --to :9001", f"--credentials {ALONE}"),
-        ("loss 5%", "an emulator on its own needs --listen and --to, or --links; see --help"),
+        ("loss 5%", "--listen and --to are missing, or --links FILE; see --help"),
         ("set lab --session x", "unrecognized arguments: --session"),
     ],
 )
