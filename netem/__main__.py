@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from netem.core.command_line import stoppable_imports
+from netem.core.command_line import stoppable_imports, stoppable_until_exit
 
 with stoppable_imports():
     from netem.core.command_line import Parser, netem_program, report_failure, why_not_written
@@ -70,6 +70,7 @@ def _measure(words: Sequence[str]) -> ExitStatus:
 
 def command() -> NoReturn:
     """Run the command ``noack-netem``."""
+    stoppable_until_exit()  # also while parts are imported that only some commands need
     guard_streams(ignore_broken_pipes=False)  # the emulator ends when its output is closed
     sys.exit(main())
 

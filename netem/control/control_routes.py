@@ -23,7 +23,7 @@ from netem.core.errors import CallerError, NoackError, printable, shortened, wit
 from netem.core.json_text import parse_json
 from netem.core.settings_section import ScenarioSection
 from netem.impairments.link_settings import LinkSettings
-from netem.impairments.target_loss import with_target_loss
+from netem.link_state import LinkState
 from netem.links_file import Side
 from netem.relay.relay_reports import DIRECTIONS, Direction, LinkReport
 from netem.tc_words import words_of
@@ -173,7 +173,7 @@ class ControlRoutes:
         for direction, settings in changes.items():
             _require_read(settings, f"{source}: {direction}")
             try:
-                with_target_loss(settings)
+                LinkState(settings, 0)  # the relay accepts it
             except ValueError as error:
                 raise CallerError(f"{source}: {direction}: {error}") from None
         self._commands.change(name, changes)

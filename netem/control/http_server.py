@@ -39,9 +39,11 @@ _REQUEST_S = 10.0
 """Longest time in which a request arrives."""
 _ANSWER_S = 10.0
 """Longest time in which a client takes its answer."""
-_REST_S, _REST_BYTES = 1.0, 16 * 2**20
-"""Of the rest of a refused request: it is read, because closing the socket before would reset the
-connection, and the answer would be lost."""
+_REST_S = 1.0
+"""Longest pause in the rest of a refused request: it is read, because closing the socket before would
+reset the connection, and the answer would be lost."""
+_REST_BYTES = 2**18
+"""Bytes of the rest that are read at once."""
 _BUSY_S = 1.0
 """Longest wait for one of the connections to end."""
 _POLL_S = 0.1
@@ -121,9 +123,9 @@ class _ConnectionHandler(BaseHTTPRequestHandler):
         with suppress(OSError):  # the client has gone, or is too slow
             self.handle_one_request()
             self.connection.shutdown(socket.SHUT_WR)
-            rest = _Arriving(self.connection, _REST_BYTES, _REST_S)
-            buffer = bytearray(io.DEFAULT_BUFFER_SIZE)
-            while rest.readinto(buffer):
+            self.connection.settimeout(_REST_S)
+            until_s = time.monotonic() + _REQUEST_S
+            while self.connection.recv(_REST_BYTES) and time.monotonic() < until_s:
                 pass
 
     def handle_expect_100(self) -> bool:

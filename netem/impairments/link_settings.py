@@ -23,6 +23,8 @@ from netem.impairments.kinds.delay import Delay
 from netem.impairments.kinds.loss import LossOf
 from netem.impairments.kinds.rate import Rate
 
+MOST_IMPAIRMENTS = 1024
+"""As native/network/link_new.c has it."""
 Mansd = Annotated[int, Field(ge=0, le=1_000_000)]
 USUAL_LIMIT = 16_384
 """Packets that may be delayed at once, by default: far more than loops ever have in flight."""
@@ -33,7 +35,7 @@ class LinkSettings(ScenarioSection):
     """Settings of one direction of a link; they apply to the packets of each flow."""
 
     impairments: tuple[AnyImpairment, ...] = ()
-    """The impairments, applied in this order."""
+    """The impairments, applied in this order; at most 1024."""
     mansd: Mansd | None = None
     """At most this number of packets of a flow in a row is not effectively delivered."""
     constraints: Constraints = ()
@@ -85,6 +87,8 @@ class LinkSettings(ScenarioSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if (count := len(self.impairments)) > MOST_IMPAIRMENTS:
+            raise ValueError(f"impairments: {count} impairments; expected at most {MOST_IMPAIRMENTS}")
         require_consistent(self.mansd, self.constraints)
         require_scores(self.impairments)
         require_order(self.impairments)

@@ -3,7 +3,7 @@
 import ctypes
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 
 import numpy as np
 
@@ -62,10 +62,6 @@ class Relay:
         self.on_timed_change: Callable[[TimedChange, Counters], None] = lambda change, counters: None
         """Called after each change of the timetable with the counts until then."""
         self.specs: Sequence[LinkSpec] = tuple(specs)
-        # The sockets of the links, or the two devices of a shell.
-        self._open_links: Sequence[OpenLink | DeviceLink] = (
-            open_links(self.specs) if devices is None else [devices]
-        )
         self._warnings = [LinkWarnings(spec) for spec in self.specs]
         self._losses = [UnintendedLosses(spec.name, side) for spec in specs for side in DIRECTIONS]
         self._epoch_ns = self._next_check_ns = 0
@@ -73,15 +69,14 @@ class Relay:
         self._memory.core.spin_ns = spin_ns
         # Direction 2k is forward of link k, and 2k + 1 is its reverse, as in the core.
         self._directions = [
-            RelayDirection(
-                getattr(spec, side),
-                spec.seed,
-                (spec.stream, side),
-                self._memory.core.directions[2 * number + reverse],
-            )
+            self._new_direction(spec, side, 2 * number + reverse)
             for number, spec in enumerate(self.specs)
             for reverse, side in enumerate(DIRECTIONS)
         ]
+        # The sockets of the links, or the two devices of a shell.
+        self._open_links: Sequence[OpenLink | DeviceLink] = (
+            open_links(self.specs) if devices is None else [devices]
+        )
         for number in range(len(self.specs)):
             self._listen(number)
         self._clients = ClientTable(self._open_links, self._warnings, self._directions, self._memory)
@@ -119,6 +114,11 @@ class Relay:
             self._relay_until(now_ns + _PERIOD_NS)
         self._end()
 
+    def _new_direction(self, spec: LinkSpec, side: Direction, number: int) -> RelayDirection:
+        with _refused(spec.name, side):
+            row = self._memory.core.directions[number]
+            return RelayDirection(getattr(spec, side), spec.seed, (spec.stream, side), row)
+
     def change(self, link: str, direction: Direction, settings: LinkSettings) -> None:
         """Change a direction's impairments between two datagrams.
 
@@ -126,11 +126,12 @@ class Relay:
         in flight leave at their planned times.
 
         Raises:
-            CallerError: there is no such link.
+            CallerError: there is no such link, or it cannot have the settings.
         """
         number = self._number_of(link, direction)
         changed = self._directions[number]
-        changed.change(settings, self._memory.latest_ns(number, changed.rows))
+        with _refused(link, direction):
+            changed.change(settings, self._memory.latest_ns(number, changed.rows))
         self._stamp_arrivals(number)
 
     def _apply_due(self, now_ns: int) -> None:
@@ -286,3 +287,12 @@ class Relay:
                 stamp_arrivals(link.endpoint)
             else:
                 self._clients.stamp_arrivals(direction // 2)
+
+
+@contextmanager
+def _refused(link: str, direction: Direction) -> Iterator[None]:
+    """Raise CallerError in place of ValueError for settings that the core refuses."""
+    try:
+        yield
+    except ValueError as error:
+        raise CallerError(f"link {link} {direction}: {error}") from None

@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+import pytest
 from hypothesis import assume, given
 
-from netem.impairments.link_settings import LinkSettings
+from netem.core.errors import CallerError
+from netem.impairments.link_settings import MOST_IMPAIRMENTS, LinkSettings
 from netem.tc_words import parse, settings_of, words_of
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.impairments.any_link_settings import settings, words_can_say
@@ -44,3 +46,9 @@ def test_the_lines_about_mistakes_are_those_that_were_approved() -> None:
     compare_lines(
         Path(__file__).with_name("word_mistakes.txt"), lambda words: lines_of_error(lambda: parse(words))
     )
+
+
+def test_there_is_a_limit_on_the_number_of_impairments() -> None:
+    assert len(settings_of("loss 5% " * MOST_IMPAIRMENTS).impairments) == MOST_IMPAIRMENTS
+    with pytest.raises(CallerError, match=r"^1025 impairments; expected at most 1024$"):
+        settings_of("loss 5% " * 1025)

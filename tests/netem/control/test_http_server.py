@@ -88,6 +88,13 @@ def test_a_body_as_long_as_permitted_is_read(relay: FakeRelay, server: ControlAd
     assert (answer.status, relay.changes) == (413, 1)
 
 
+def test_a_body_that_is_much_too_large_has_its_answer_too(server: ControlAddresses) -> None:
+    """A client that reads after it has sent everything: the connection is not reset before."""
+    length = 64 * 2**20
+    head = b"PATCH /links/up HTTP/1.1\r\nContent-Length: %d\r\n\r\n" % length
+    assert send(unix(server), head + bytes(length)).status == 413
+
+
 def test_a_client_is_told_to_send_a_large_body(server: ControlAddresses) -> None:
     """curl waits for that before it sends one."""
     head = b"PATCH /links/up HTTP/1.1\r\nExpect: 100-continue\r\nContent-Length: %d\r\n\r\n"

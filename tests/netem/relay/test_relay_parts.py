@@ -7,7 +7,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -83,6 +83,19 @@ def test_a_link_whose_address_cannot_be_used_is_refused() -> None:
         ):
             with pytest.raises(CallerError, match=message):
                 open_and_close(specs)
+
+
+def test_settings_that_the_core_refuses_are_a_mistake_of_the_caller() -> None:
+    """Whatever limits the core has: the relay stays as it was."""
+    many = settings_of("loss 5%").impairments * 1025
+    wrong = LinkSettings().model_copy(update={"impairments": many})
+    message = "^link test forward: link: there are more than 1024 stages"
+    with pytest.raises(CallerError, match=message):
+        Relay([link(("127.0.0.1", 9), wrong)])
+    with closing(Relay([link(("127.0.0.1", 9), settings_of("mansd 2"))])) as relay:
+        with pytest.raises(CallerError, match=message):
+            relay.change("test", "forward", wrong)
+        assert relay.report()[0].forward.settings == settings_of("mansd 2")
 
 
 ROWS, PLACES = 24, 32

@@ -66,6 +66,8 @@ TERM = (signal.SIGTERM, 143, "stopped on request (SIGTERM)")
     [
         (["cosim.cli", "typer", "--version"], INT),
         (["netem", "netem.core.system_processes", "--help"], INT),
+        (["netem", "netem.stand_alone", "--listen", ":0", "--to", ":9"], INT),
+        (["netem", "netem.measurement.measure_command", "measure", "x"], INT),
         (["noack.network_process", "noack.machines.channel", "--help"], INT),
         (["plant_server", "noack.runtime.run_process", "--help"], TERM),
     ],
