@@ -7,13 +7,14 @@ requests to them; docs/netem-control.md has the documents.
 import traceback
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
+from threading import Lock
 from typing import ClassVar, NamedTuple
 from urllib.parse import unquote, urlsplit
 
 from pydantic import ValidationError, model_validator
 from pydantic_core import to_json
 
-from netem.control.command_queue import CommandQueue
+from netem.control.command_queue import AppliedSettings, CommandQueue, Snapshot
 from netem.control.emulator_statistics import Statistics
 from netem.control.metrics_text import METRICS_TYPE, metrics_text
 from netem.core import toml_file
@@ -26,7 +27,6 @@ from netem.impairments.link_settings import LinkSettings
 from netem.link_state import LinkState
 from netem.links_file import Side
 from netem.relay.relay_reports import DIRECTIONS, Direction, LinkReport
-from netem.tc_words import words_of
 
 JSON_TYPE = "application/json"
 _PATHS = "/links, /links/NAME, /stats, /metrics"
@@ -98,6 +98,8 @@ class ControlRoutes:
     def __init__(self, commands: CommandQueue, current: Callable[[], Statistics]) -> None:
         self._commands = commands
         self._current = current
+        self._turn = Lock()
+        """For answers that may be large: many at a time would leave the relay's thread no turn."""
 
     def answer(self, method: str, target: str, body: bytes) -> Answer:
         """Return the answer to a request; a request with a mistake changes nothing."""
@@ -133,7 +135,7 @@ class ControlRoutes:
             case ["links", encoded] if encoded:
                 name = unquote(encoded)
                 routes = {
-                    "GET": lambda _: _json_answer(self._link(name)),
+                    "GET": lambda _: self._link(name),
                     "PATCH": lambda body: self._change(name, body),
                 }
             case ["stats"]:
@@ -153,12 +155,16 @@ class ControlRoutes:
         return routes[method]
 
     def _links(self, _: bytes) -> Answer:
-        return _json_answer({"links": [_link_document(link) for link in self._commands.snapshot().links]})
+        snapshot = self._commands.snapshot()
+        with self._turn:
+            return _json_answer({"links": [_link_document(link, snapshot) for link in snapshot.links]})
 
-    def _link(self, name: str) -> object:
-        for link in self._commands.snapshot().links:
+    def _link(self, name: str) -> Answer:
+        snapshot = self._commands.snapshot()
+        for link in snapshot.links:
             if link.name == name:
-                return _link_document(link)
+                with self._turn:
+                    return _json_answer(_link_document(link, snapshot))
         raise self._no_link(name)
 
     def _no_link(self, name: str) -> _RefusedError:
@@ -177,7 +183,7 @@ class ControlRoutes:
             except ValueError as error:
                 raise CallerError(f"{source}: {direction}: {error}") from None
         self._commands.change(name, changes)
-        return _json_answer(self._link(name))
+        return self._link(name)
 
     def _metrics(self, _: bytes) -> Answer:
         return Answer(HTTPStatus.OK, metrics_text(self._current()), METRICS_TYPE)
@@ -210,13 +216,13 @@ def _read_change(body: bytes, source: str) -> LinkChange:
         raise CallerError("\n".join(toml_file.explain(error, source, LinkChange))) from None
 
 
-def _link_document(link: LinkReport) -> object:
+def _link_document(link: LinkReport, snapshot: Snapshot) -> object:
     addresses = {"name": link.name, "listen": address_text(link.listen), "to": address_text(link.to)}
-    return addresses | {name: _settings_document(getattr(link, name).settings) for name in DIRECTIONS}
+    return addresses | {name: _settings_document(snapshot.applied[link.name, name]) for name in DIRECTIONS}
 
 
-def _settings_document(settings: LinkSettings) -> object:
-    return {"words": words_of(settings), "settings": settings.model_dump(mode="json")}
+def _settings_document(applied: AppliedSettings) -> object:
+    return {"words": applied.words, "settings": applied.settings.model_dump(mode="json")}
 
 
 def _require_read(settings: LinkSettings, source: str) -> None:

@@ -45,7 +45,7 @@ TIMETABLES_WORDS = [
     b",", b'"', b"\n", b"time_s", b"1e9", b"1000000001", b"-1", b"nan", b"both", b"reverse", b"two", b"like ",
     b"mansd 3", b"loss trace any.txt", b"loss 30% keep",
 ]  # fmt: skip
-PRESETS_KNOWN = vocabulary(json_schema(Preset))
+PRESETS_KNOWN = vocabulary(json_schema(Preset), dates=True)
 PRESETS_BASES = [preset.model_dump(exclude_none=True) for preset in shipped_presets().values()]
 PRESETS_SEEDS = [b'name = "any"\nsentence = "x"\nforward = "loss 5%"\nfit = "by eye"\nis_guess = true\n']
 

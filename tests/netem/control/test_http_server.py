@@ -10,11 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from netem.control import http_server
+from netem.control import command_queue, http_server
 from netem.control.command_queue import CommandQueue
 from netem.control.control_server import TOKEN_VARIABLE, ControlAddresses, TcpAccess, control_server
 from netem.control.http_server import BODY_BYTES, CONNECTIONS, HEAD_BYTES
 from netem.core.errors import CallerError
+from netem.impairments.link_settings import LinkSettings
 from netem.tc_words import settings_of
 from tests.helpers.waiting import wait_for
 from tests.netem.control.fake_relay import FakeRelay, options
@@ -294,3 +295,19 @@ def test_a_wrong_token_or_port_is_refused_at_the_start(
 def test_options_of_a_port_belong_together(words: str, line: str) -> None:
     with pytest.raises(CallerError, match=line):
         options(*words.split())
+
+
+def test_the_words_of_settings_are_written_once(
+    server: ControlAddresses, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a table with 250,000 delays take seconds of the processor, which the relay needs, too."""
+    written: list[LinkSettings] = []
+
+    def words(settings: LinkSettings) -> str:
+        written.append(settings)
+        return "words"
+
+    monkeypatch.setattr(command_queue, "words_of", words)
+    for path in ("/links", "/links", "/links/up", "/stats"):
+        assert request(unix(server), "GET", path).status == 200
+    assert len(written) == 4  # of two links, in two directions

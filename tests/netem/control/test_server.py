@@ -162,7 +162,7 @@ def test_an_internal_error_is_reported_and_the_server_continues(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     with monkeypatch.context() as context:
-        context.setattr("netem.control.control_routes._link_document", lambda _: 1 / 0)
+        context.setattr("netem.control.control_routes._link_document", lambda *_: 1 / 0)
         answer = request(unix(server), "GET", "/links")
     assert answer.status == 500
     assert "ZeroDivisionError" in answer.document["error"]
