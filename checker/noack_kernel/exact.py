@@ -255,6 +255,21 @@ def exponential(F: Matrix, seconds: arb) -> arb_mat:
     return found
 
 
+def power(M: arb_mat, exponent: int) -> arb_mat:
+    """Return balls around each product of so many matrices that are within M and may differ.
+
+    flint squares a matrix by other rules than it multiplies two: its balls are those of M M with the same M.
+    """
+    found, factor = arb_mat(unit_rows(range(M.nrows()), M.nrows()).mid), M
+    while exponent:
+        if exponent % 2:
+            found = factor * found
+        exponent //= 2
+        if exponent:
+            factor = factor * arb_mat(factor)
+    return found
+
+
 def decay_below(rate: fmpq, seconds: fmpq) -> fmpq:
     """Return an exact number d ≤ e^{−rs}, close to it."""
     if rate * seconds > _LARGEST_DECAY:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from noack_kernel.exact import Matrix, RejectedError, exponential, from_balls, to_balls, unit_rows
+from noack_kernel.exact import Matrix, RejectedError, exponential, from_balls, power, to_balls, unit_rows
 
 MOST_SUB_STEPS = 20_000
 """Of all flows of an edge."""
@@ -88,7 +88,7 @@ class Products:
         found = self._identity()
         for step in steps:
             if isinstance(step, Repeat):
-                found = self._product(step.steps) ** step.times * found
+                found = power(self._product(step.steps), step.times) * found
             else:
                 found = self._map(step) * found
         return found

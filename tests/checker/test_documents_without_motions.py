@@ -577,3 +577,31 @@ def test_a_flow_is_bounded_between_the_points_at_which_it_is_tested() -> None:
     for level, sub_step in ((1.1, 0.1), (1.1, 0.05), (1.1, 0.03), (0.9, 0.001)):
         with pytest.raises(RejectedError, match=r"not proven at during/turn|not proven at output/on"):
             proven(document, bound(level, sub_step))
+
+
+@pytest.mark.parametrize("times", [1, 2, 4])
+def test_a_step_that_is_repeated_has_another_matrix_of_its_interval_each_time(times: int) -> None:
+    """x := −x + b with |b| ≤ 1: twice the same b leave x as it is, but b may be 1 and then −1."""
+    document = turning([[1, 0], [0, 1]]) | {
+        "coordinates": [{"name": "x", "unit": ""}, {"name": "f2", "unit": ""}],
+        "constant": "f2",
+        "steps": {
+            "push": {"words": "x is turned and pushed", "matrix": [[-1, [-1, 1]], [0, 1]]},
+            "wait": {"words": "nothing moves", "matrix": [[0, 0], [0, 0]]},
+        },
+        "locations": [{"name": "on", "coordinates": ["x"], "motion": None, "facts": []}],
+        "start": {"location": "on", "columns": [[1], [1]], "facts": []},
+        "outputs": [{"name": "x", "unit": "", "rows": [[1, 0]], "in": ["on"]}],
+    }
+    wait = {"exp": "wait", "seconds": 1}
+    bound = proof_of({
+        "output": "x", "from": "start", "decay": 0, "levels": [0, 1],
+        "matrices": {"P": [[1, 0], [0, -1]]},
+        "forms": {"on": {"nodes": [0], "terms": [[{"matrix": "P", "on": [0, 1], "times": 1}]]}},
+        "multipliers": {},
+    })  # fmt: skip
+    document["edges"][0]["jump"] = [wait]
+    assert proven(document, bound)[0]
+    document["edges"][0]["jump"] = [{"repeat": ["push"], "times": times}, wait]
+    with pytest.raises(RejectedError, match="not proven at edge/turn"):
+        proven(document, bound)
