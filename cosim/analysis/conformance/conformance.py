@@ -14,11 +14,12 @@ which the trace has z, before and after: the result says which share that is.
 
 Between two steps of the plant the input is constant. A motion whose corners have a common part,
 Fᵢ = F + B Uᵢ, moves as ż = F z + B u + Σ c p with u = Σ λᵢ Uᵢ z. So z at the end follows from z and u, but
-for the signals p, which may change during the step; and u is in the hull of the Uᵢ z at both ends. All is
-computed in floating point, with tolerances relative to the sizes of the terms.
+for the signals p, which may change during the step; and u is in the hull of the Uᵢ z at both ends. A signal
+is at most Σ λᵢ |Rᵢ z| with the λ of this u, and has the sign that the document may require. All is computed
+in floating point, with tolerances relative to the sizes of the terms.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -123,10 +124,17 @@ class _Checked:
 
     def _require_start(self, start: Table) -> None:
         """Require that z is that of the start, where its facts hold."""
+        clock_ns, t_ns = self._clocks_ns[:1], self._trace.t_ns
+        self._require_clock(
+            np.zeros(1, int), clock_ns == 0, Failed.CLOCK, start["location"], clock_ns, (0, 0)
+        )
+        if (still := np.flatnonzero(np.diff(t_ns) <= 0)).size:
+            what = "the steps of the record do not follow each other in time"
+            raise RefutedError(Failure(float(t_ns[still[0]]) / NS_PER_S, Failed.PATH, detail=what))
         first = self._z(np.zeros(1, int))
         Z, noise, z = self._document.start(), first[0, self._document.noise], first[0, self._states]
         expected = (Z @ np.append(1.0, noise))[self._states]
-        if (np.abs(z - expected) > STATE * (1 + np.abs(expected))).any():
+        if not (np.abs(z - expected) <= STATE * (1 + np.abs(expected))).all():
             raise RefutedError(Failure(self._time_s(0), Failed.JUMP, "start"))
         for fact in start["facts"]:
             self._require(np.zeros(1, int), self._holds(fact, first), Failed.FACT, "start", fact)
@@ -235,37 +243,33 @@ class _Checked:
             rest = then - now @ flow.state.T - inputs @ flow.input.T
             scale = np.abs(now) @ np.abs(split.F).T + np.abs(inputs) @ np.abs(split.B).T
             allowed = MOTION * length * scale + STATE * 1e-3 * np.abs(then) + TINY * self._largest
+            ranges = _ranges(split, inputs, now, then)
             explained = self._explained(
-                rest[:, self._states], allowed[:, self._states], flow, self._states, split, now, then
+                rest[:, self._states], allowed[:, self._states], flow, self._states, ranges
             )
             self._require(here, explained, Failed.MOTION, location["name"])
 
     @staticmethod
     def _explained(
-        rest: Vector,
-        free: Vector,
-        flow: MotionStep,
-        states: list[int],
-        split: MotionParts,
-        now: Vector,
-        then: Vector,
+        rest: Vector, free: Vector, flow: MotionStep, states: list[int], ranges: tuple[Vector, Vector]
     ) -> Flags:
-        """Return which rests are Σ column p with |p| ≤ |Rz|, but for what is ``free``.
+        """Return which rests are Σ column p with p in its range, but for what is ``free``.
 
-        Signals may vary during a step: |Rz| is the larger one of both ends, plus what it changes by; and what
-        a signal that varies has more or less than a constant one is free, too. Signals are found by
-        projections in turn, on those that explain the rest and on those within their limits.
+        What a signal that varies has more or less than a constant one is free, too. Signals are found by
+        projections in turn, on those that explain the rest and on those within their ranges.
         """
         columns, varied = flow.signals[states], flow.varied[states]
         if not columns.shape[1]:
             return np.asarray((np.abs(rest) <= free).all(axis=1))
-        sizes = [[np.linalg.norm(z @ R.T, axis=1) for z in (now, then, then - now)] for R in split.rows]
-        limits = np.stack([np.maximum(first, last) + change for first, last, change in sizes], axis=1)
+        lowest, highest = ranges
+        limits = (highest - lowest) / 2
+        rest = rest - (highest + lowest) / 2 @ columns.T
         free = free + limits @ varied.T
         near = np.abs(rest) <= free
         explained = np.asarray(near.all(axis=1))
         moved = columns.any(axis=1)  # the coordinates on which signals have an effect
-        open_ = np.flatnonzero(~explained & near[:, ~moved].all(axis=1))
+        is_number = np.isfinite(rest).all(axis=1) & np.isfinite(free).all(axis=1)
+        open_ = np.flatnonzero(~explained & is_number & near[:, ~moved].all(axis=1))
         unit, columns = free[np.ix_(open_, moved)], columns[moved]
         effects = columns * limits[open_][:, None, :] / unit[:, :, None]  # (steps, coordinates, signals)
         explained[open_] = _reachable(effects, rest[np.ix_(open_, moved)] / unit)
@@ -296,6 +300,10 @@ class _Checked:
         x_is_known = self._trace.is_recorded.all() and np.isfinite(self._trace.readings["x"]).all()
         if "x" not in readings or not x_is_known:
             raise RefutedError(Failure(self._time_s(0), Failed.READING, detail="x"))
+        read = {place for _, places in readings["x"] for place in places}
+        for name in self._document.locations:
+            if name not in read and (at := self._motions_of(name)).size:
+                raise RefutedError(Failure(self._time_s(int(at[0])), Failed.READING, name, "x"))
         for name, parts in readings.items():
             recorded = self._trace.readings[name]
             for rows, places in parts:
@@ -383,6 +391,61 @@ class _Checked:
             first = int(np.argmin(holds))
             found, low, high = (float(value) / NS_PER_S for value in (clock_ns[first], *allowed_ns))
             raise RefutedError(Failure(self._time_s(at[first]), kind, place, "", found, low, high))
+
+
+def _ranges(split: MotionParts, u: Vector, now: Vector, then: Vector) -> tuple[Vector, Vector]:
+    """Return the least and the largest value of each signal during steps, (steps, signals) each.
+
+    Signals may vary during a step: what bounds one is the larger value of both ends, plus what it changes by.
+    """
+    mixtures = [_mixtures(split, z, u) for z in (now, then)]
+    lowest, highest = np.zeros((2, len(u), len(split.signals)))
+    for k, signal in enumerate(split.signals):
+        first, last = (
+            _mixed_sizes(signal.rows, z, mixture) for z, mixture in zip((now, then), mixtures, strict=True)
+        )
+        limit = np.maximum(first, last) + _mixed_sizes(signal.rows, then - now, mixtures[1])
+        lowest[:, k], highest[:, k] = -limit, limit
+        if signal.along is not None:  # p is between 0 and Cz/k
+            ends = np.stack([z @ signal.along[0] for z in (now, then)])
+            change = np.abs(ends[1] - ends[0])
+            below, above = np.minimum(ends.min(axis=0) - change, 0), np.maximum(ends.max(axis=0) + change, 0)
+            if signal.least > 0:
+                below, above = below / signal.least, above / signal.least
+            else:  # any p of this sign
+                below, above = np.where(below < 0, -np.inf, 0.0), np.where(above > 0, np.inf, 0.0)
+            lowest[:, k], highest[:, k] = np.maximum(-limit, below), np.minimum(limit, above)
+    return lowest, highest
+
+
+def _mixtures(split: MotionParts, z: Matrix, u: Vector) -> Vector | None:
+    """Return λ with Σ λᵢ Uᵢ z = u, or nearly, (steps, corners); None if no signal's limit depends on it."""
+    if all(len(signal.rows) == 1 for signal in split.signals):
+        return None
+    corners = np.stack([z @ U.T for U in split.U], axis=1)  # (steps, corners, m)
+    found, steps = np.zeros(corners.shape[:2]), np.arange(len(z))
+    if u.shape[1] == 1:  # a mixture of the least and the largest one
+        least, largest = corners[:, :, 0].argmin(axis=1), corners[:, :, 0].argmax(axis=1)
+        low, high = corners[steps, least, 0], corners[steps, largest, 0]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = np.where(high > low, np.clip((u[:, 0] - low) / (high - low), 0, 1), 0)
+        found[steps, least] += 1 - share
+        found[steps, largest] += share
+        return found
+    for step in steps[np.isfinite(corners).all(axis=(1, 2)) & np.isfinite(u).all(axis=1)]:
+        room = np.abs(corners[step]).max() or 1.0
+        weights = np.vstack([corners[step].T / room, np.ones(len(split.U))])
+        mixture = nnls(weights, np.append(u[step] / room, 1.0))[0]
+        found[step] = mixture / (mixture.sum() or 1.0)
+    return found
+
+
+def _mixed_sizes(rows: Sequence[Matrix], z: Matrix, mixture: Vector | None) -> Vector:
+    """Return Σ λᵢ |Rᵢ z|, (steps,)."""
+    if len(rows) == 1 or mixture is None:
+        return np.asarray(np.linalg.norm(z @ rows[0].T, axis=1))
+    sizes = np.stack([np.linalg.norm(z @ R.T, axis=1) for R in rows], axis=1)
+    return np.asarray((mixture * sizes).sum(axis=1))
 
 
 def _reachable(effects: Vector, rest: Vector) -> Flags:

@@ -18,14 +18,24 @@ TINY = 1e-12
 _PARTS = 8
 
 
+class SignalLimits(NamedTuple):
+    """What bounds an unknown signal p: |p| ≤ Σ λᵢ |Rᵢ z|, and perhaps p · Cz ≥ k p²."""
+
+    rows: Sequence[Matrix]
+    """Rᵢ by corner; a single one if all corners have the same."""
+    along: Matrix | None
+    """C, (1, coordinates)."""
+    least: float
+
+
 class MotionParts(NamedTuple):
-    """A motion ż = F z + B u + Σ c p with u in the hull of Uᵢ z."""
+    """A motion ż = F z + B u + Σ c p with u = Σ λᵢ Uᵢ z."""
 
     F: Matrix
     B: Matrix
     U: Sequence[Matrix]
     columns: Matrix
-    rows: Sequence[Matrix]
+    signals: Sequence[SignalLimits]
 
 
 class MotionStep(NamedTuple):
@@ -87,21 +97,24 @@ class DocumentNumbers:
 
     @cached_method
     def split(self, motion: str) -> MotionParts | None:
-        """Return the parts of a motion; None: its corners have no common part."""
+        """Return the parts of a motion; None: its corners have no common part, or other signals."""
         corners = self.table["motions"][motion]
+        moved = [[{**each, "rows": None} for each in corner["unknown"]] for corner in corners]
+        if any(each != moved[0] for each in moved):
+            return None
         F = [_matrix(corner["matrix"]) for corner in corners]
         U = [_matrix(corner["input"]) for corner in corners]
         unknown = corners[0]["unknown"]
         columns = np.hstack([_matrix(each["column"]) for each in unknown] or [np.zeros((len(F[0]), 0))])
-        rows = [_matrix(each["rows"]) for each in unknown]
+        signals = [_limits([corner["unknown"][k] for corner in corners]) for k in range(len(unknown))]
         if len(corners) == 1:  # then u is U z, and F has its part
-            return MotionParts(F[0], np.zeros((len(F[0]), len(U[0]))), U, columns, rows)
+            return MotionParts(F[0], np.zeros((len(F[0]), len(U[0]))), U, columns, signals)
         mean_F, mean_U = sum(F) / len(F), sum(U) / len(U)
         differences = np.hstack([each - mean_U for each in U]), np.hstack([each - mean_F for each in F])
         B = differences[1] @ np.linalg.pinv(differences[0])
         if np.abs(B @ differences[0] - differences[1]).max(initial=0) > 1e-6 * (np.abs(mean_F).max() + TINY):
             return None
-        return MotionParts(np.asarray(mean_F - B @ mean_U), B, U, columns, rows)
+        return MotionParts(np.asarray(mean_F - B @ mean_U), B, U, columns, signals)
 
     @cached_method
     def flow(self, motion: str, length_s: float) -> MotionStep:
@@ -113,6 +126,15 @@ class DocumentNumbers:
         whole[:n, :n], whole[:n, n : n + m], whole[:n, n + m :] = split.F, split.B, split.columns
         moved = expm(whole * length_s)[:n]
         return MotionStep(moved[:, :n], moved[:, n : n + m], moved[:, n + m :], _variation(split, length_s))
+
+
+def _limits(by_corner: Sequence[Table]) -> SignalLimits:
+    """Return what bounds a signal, of its entries in all corners."""
+    first = by_corner[0]
+    is_same = all(each["rows"] == first["rows"] for each in by_corner)
+    rows = [_matrix(each["rows"]) for each in (by_corner[:1] if is_same else by_corner)]
+    along = _matrix(first["along"]) if "along" in first else None
+    return SignalLimits(rows, along, value(first.get("least", 0)))
 
 
 def _variation(split: MotionParts, length_s: float) -> Matrix:
