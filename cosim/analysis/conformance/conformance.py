@@ -243,10 +243,12 @@ class _Checked:
             rest = then - now @ flow.state.T - inputs @ flow.input.T
             scale = np.abs(now) @ np.abs(split.F).T + np.abs(inputs) @ np.abs(split.B).T
             allowed = MOTION * length * scale + STATE * 1e-3 * np.abs(then) + TINY * self._largest
-            ranges = _ranges(split, inputs, now, then)
-            explained = self._explained(
-                rest[:, self._states], allowed[:, self._states], flow, self._states, ranges
-            )
+            rest, allowed = rest[:, self._states], allowed[:, self._states]
+            explained = self._explained(rest, allowed, flow, self._states, _ranges(split, now, then))
+            if any(len(signal.rows) > 1 for signal in split.signals):  # the mixture may allow more
+                left = np.flatnonzero(~explained)
+                ranges = _ranges(split, now[left], then[left], inputs[left])
+                explained[left] = self._explained(rest[left], allowed[left], flow, self._states, ranges)
             self._require(here, explained, Failed.MOTION, location["name"])
 
     @staticmethod
@@ -393,13 +395,14 @@ class _Checked:
             raise RefutedError(Failure(self._time_s(at[first]), kind, place, "", found, low, high))
 
 
-def _ranges(split: MotionParts, u: Vector, now: Vector, then: Vector) -> tuple[Vector, Vector]:
+def _ranges(split: MotionParts, now: Vector, then: Vector, u: Vector | None = None) -> tuple[Vector, Vector]:
     """Return the least and the largest value of each signal during steps, (steps, signals) each.
 
     Signals may vary during a step: what bounds one is the larger value of both ends, plus what it changes by.
+    Without ``u`` it is what all mixtures of corners allow.
     """
-    mixtures = [_mixtures(split, z, u) for z in (now, then)]
-    lowest, highest = np.zeros((2, len(u), len(split.signals)))
+    mixtures = [None if u is None else _mixtures(split, z, u) for z in (now, then)]
+    lowest, highest = np.zeros((2, len(now), len(split.signals)))
     for k, signal in enumerate(split.signals):
         first, last = (
             _mixed_sizes(signal.rows, z, mixture) for z, mixture in zip((now, then), mixtures, strict=True)
@@ -418,10 +421,8 @@ def _ranges(split: MotionParts, u: Vector, now: Vector, then: Vector) -> tuple[V
     return lowest, highest
 
 
-def _mixtures(split: MotionParts, z: Matrix, u: Vector) -> Vector | None:
-    """Return λ with Σ λᵢ Uᵢ z = u, or nearly, (steps, corners); None if no signal's limit depends on it."""
-    if all(len(signal.rows) == 1 for signal in split.signals):
-        return None
+def _mixtures(split: MotionParts, z: Matrix, u: Vector) -> Vector:
+    """Return λ with Σ λᵢ Uᵢ z = u, or nearly, (steps, corners)."""
     corners = np.stack([z @ U.T for U in split.U], axis=1)  # (steps, corners, m)
     found, steps = np.zeros(corners.shape[:2]), np.arange(len(z))
     if u.shape[1] == 1:  # a mixture of the least and the largest one
@@ -441,10 +442,10 @@ def _mixtures(split: MotionParts, z: Matrix, u: Vector) -> Vector | None:
 
 
 def _mixed_sizes(rows: Sequence[Matrix], z: Matrix, mixture: Vector | None) -> Vector:
-    """Return Σ λᵢ |Rᵢ z|, (steps,)."""
-    if len(rows) == 1 or mixture is None:
-        return np.asarray(np.linalg.norm(z @ rows[0].T, axis=1))
+    """Return Σ λᵢ |Rᵢ z|, (steps,); without a mixture the least of all."""
     sizes = np.stack([np.linalg.norm(z @ R.T, axis=1) for R in rows], axis=1)
+    if len(rows) == 1 or mixture is None:
+        return np.asarray(sizes.min(axis=1))
     return np.asarray((mixture * sizes).sum(axis=1))
 
 
