@@ -330,7 +330,7 @@ def _require_still_edges(document: Document, claim: Claim, text: str) -> None:
             if not edge.jump.has_row(index, {index: fmpq(1)}):
                 name = document.coordinates[index]
                 raise RejectedError(f"equations: edge {edge.name}: it changes the state {name!r}")
-    if any("duration" in entry for entry in entries(read_table(text, FORMAT)["edges"], "edges")):
+    if any("duration" in entry for entry in entries(read_table(text, FORMAT, "document")["edges"], "edges")):
         raise RejectedError("equations: an edge takes time, in which nothing is compared")
 
 

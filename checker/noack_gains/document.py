@@ -175,7 +175,7 @@ class Document:
     """
 
     def __init__(self, text: str) -> None:
-        table = read_table(text, FORMAT)
+        table = read_table(text, FORMAT, "document")
         fields(table, "document", _REQUIRED, _OPTIONAL)
         self.digest = hashlib.sha256(text.encode()).hexdigest()
         (self.name,) = names_of([table["name"]], "name")

@@ -136,14 +136,19 @@ def exact_matrix(rows: object, place: str, height: int | None, width: int) -> Ma
     return found
 
 
-def read_table(text: str, expected: str) -> Table:
+def read_table(text: str, expected: str, what: str) -> Table:
     """Return the table in a JSON text: exact numbers, no key twice, of the expected format.
+
+    Args:
+        text: the content of the file.
+        expected: the format.
+        what: the file is, for messages: the document, or the proof.
 
     Raises:
         RejectedError: it is none.
     """
     if len(text) > MOST_BYTES:
-        raise RejectedError(f"larger than {MOST_BYTES // 2**20} MiB")
+        raise RejectedError(f"the {what} is larger than {MOST_BYTES // 2**20} MiB")
     try:
         table = json.loads(
             text,
@@ -153,18 +158,27 @@ def read_table(text: str, expected: str) -> Table:
             object_pairs_hook=_once,
         )
     except RecursionError:
-        raise RejectedError("nested too deeply") from None
+        raise RejectedError(f"the {what} is nested too deeply") from None
     except json.JSONDecodeError as error:
-        raise RejectedError(f"not JSON: {error}") from None
-    if not isinstance(table, dict) or table.get("format") != expected:
-        raise RejectedError(f'not a file of the format "{expected}"')
-    return table
+        raise RejectedError(f"the {what} is not JSON: {error}") from None
+    except RejectedError as error:
+        raise RejectedError(f"the {what}: {error}") from None
+    found = table.get("format") if isinstance(table, dict) else None
+    if found != expected:
+        other = f", but one of {found[:40]!r}" if isinstance(found, str) else ""
+        raise RejectedError(
+            f'the {what} is not a file of the format "{expected}"{other}; '
+            "the order is: noack-check DOCUMENT PROOF"
+        )
+    return dict(table)
 
 
 def _once(pairs: Sequence[tuple[str, object]]) -> dict[str, object]:
-    table = dict(pairs)
-    if len(table) < len(pairs):
-        raise RejectedError("a key occurs twice")
+    table = dict[str, object]()
+    for key, value in pairs:
+        if key in table:
+            raise RejectedError(f"the key {key[:40]!r} occurs twice")
+        table[key] = value
     return table
 
 

@@ -88,7 +88,7 @@ def prove(document: str, proof: str) -> Proven:
 
 def read_proof(document: Document, proof: str) -> Table:
     """Return the table of a proof of a document."""
-    table = read_table(proof, FORMAT)
+    table = read_table(proof, FORMAT, "proof")
     fields(table, "proof", ("format", "plant", "inputs"), ("document", *_OPTIONAL))
     if "document" in table and table["document"] != document.digest:
         raise RejectedError("the proof is one of another document: it names another SHA-256")

@@ -46,7 +46,7 @@ def verify(document: Path, proof: Path) -> int:
             print(printable(f"       in which a fact is {fact!r}: {words}"))
         lines = lines_of_kernel()
         print(f"       by {proven.inequalities} inequalities, which {lines} lines of Python verified")
-        sys.stdout.flush()
+        print(end="", flush=True)
     except RejectedError as error:
         print(printable(f"REJECTED {error}"))
         return FAILED

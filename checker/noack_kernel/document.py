@@ -150,7 +150,7 @@ class Document:
     """
 
     def __init__(self, text: str) -> None:
-        table = read_table(text, FORMAT)
+        table = read_table(text, FORMAT, "document")
         required = {
             "format",
             "name",
@@ -530,14 +530,19 @@ class Document:
 # Reading.
 
 
-def read_table(text: str, expected: str) -> Table:
+def read_table(text: str, expected: str, what: str) -> Table:
     """Return the table in a JSON text: exact numbers, no key twice, of the expected format.
+
+    Args:
+        text: the content of the file.
+        expected: the format.
+        what: the file is, for messages: the document, or the proof.
 
     Raises:
         RejectedError: it is none.
     """
     if len(text) > MOST_BYTES:
-        raise RejectedError(f"larger than {MOST_BYTES // 2**20} MiB")
+        raise RejectedError(f"the {what} is larger than {MOST_BYTES // 2**20} MiB")
     try:
         table = json.loads(
             text,
@@ -547,20 +552,27 @@ def read_table(text: str, expected: str) -> Table:
             object_pairs_hook=_once,
         )
     except RecursionError:
-        raise RejectedError("nested too deeply") from None
+        raise RejectedError(f"the {what} is nested too deeply") from None
     except json.JSONDecodeError as error:
-        raise RejectedError(f"not JSON: {error}") from None
-    if not isinstance(table, dict) or table.get("format") != expected:
+        raise RejectedError(f"the {what} is not JSON: {error}") from None
+    except RejectedError as error:
+        raise RejectedError(f"the {what}: {error}") from None
+    found = table.get("format") if isinstance(table, dict) else None
+    if found != expected:
+        other = f", but one of {found[:40]!r}" if isinstance(found, str) else ""
         raise RejectedError(
-            f'not a file of the format "{expected}"; the order is: noack-check DOCUMENT PROOF'
+            f'the {what} is not a file of the format "{expected}"{other}; '
+            "the order is: noack-check DOCUMENT PROOF"
         )
-    return table
+    return dict(table)
 
 
 def _once(pairs: Sequence[tuple[str, object]]) -> dict[str, object]:
-    table = dict(pairs)
-    if len(table) < len(pairs):
-        raise RejectedError("a key occurs twice")
+    table = dict[str, object]()
+    for key, value in pairs:
+        if key in table:
+            raise RejectedError(f"the key {key[:40]!r} occurs twice")
+        table[key] = value
     return table
 
 

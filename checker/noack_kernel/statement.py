@@ -150,7 +150,7 @@ def prove(document: str, proof: str) -> Proven:
         RejectedError: a file is malformed, or an inequality is not proven: then nothing is proven.
     """
     loop = Document(document)
-    table = read_table(proof, FORMAT)
+    table = read_table(proof, FORMAT, "proof")
     fields(table, "proof", {"format", "bounds"}, {"document", "lemmas", "rows", "times", "growth"})
     if "document" in table and table["document"] != loop.digest:
         raise RejectedError("the proof is one of another document: it names another SHA-256")

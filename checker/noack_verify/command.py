@@ -43,7 +43,7 @@ def verify(document: Path, proof: Path, equations: Path | None = None) -> int:
         lines = by_gains(*texts) if format_of(texts[0]) == OF_GAINS else iter(())
         for line in (*lines, *of_equations(texts[0], of_plant)):
             print(printable(line))
-        sys.stdout.flush()
+        print(end="", flush=True)
     except (RejectedError, RejectedEquationsError) as error:
         print(printable(f"REJECTED {error}"))
         return FAILED

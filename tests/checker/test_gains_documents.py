@@ -187,7 +187,7 @@ def test_a_false_file_is_rejected(name: str) -> None:
     ("old", "new", "reason"),
     [
         ('"losses": 1', '"losses": NaN', "not a number"),
-        ('"losses": 1', '"losses": 1, "losses": 2', "a key occurs twice"),
+        ('"losses": 1', '"losses": 1, "losses": 2', "the key 'losses' occurs twice"),
         ('"losses": 1', '"losses": 1e999', "not a number"),
         ('"losses": 1', '"losses": true', "not a number"),
         ("{", "[" * 100_000, "nested too deeply|not JSON"),

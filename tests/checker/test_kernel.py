@@ -348,10 +348,10 @@ def test_a_proof_of_another_document_is_rejected() -> None:
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("[]", "not a file of the format"),
-        ("{", "not JSON"),
-        ('{"format": "noack-hybrid 2"}', "not a file of the format"),
-        ('{"format": "noack-hybrid 1", "format": "noack-hybrid 1"}', "a key occurs twice"),
+        ("[]", 'the document is not a file of the format "noack-hybrid 1"; the order'),
+        ("{", "the document is not JSON"),
+        ('{"format": "noack-hybrid 2"}', "of the format \"noack-hybrid 1\", but one of 'noack-hybrid 2'"),
+        ('{"format": "noack-hybrid 1", "format": "noack-hybrid 1"}', "the key 'format' occurs twice"),
         ('{"format": "noack-hybrid 1", "name": 1e99999999}', "not a number, or too long"),
         ('{"format": "noack-hybrid 1", "name": NaN}', "not a number"),
         ('{"format": "noack-hybrid 1", "name": ' + "[" * 100_000 + "}", "nested too deeply"),
