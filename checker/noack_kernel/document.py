@@ -487,6 +487,8 @@ class Document:
                 raise RejectedError(f"{place}: not an entry of the input")
             return Output(name, unit, None, None, index, where)
         rows = self._rows(entry.get("rows"), place)
+        if not rows.height:
+            raise RejectedError(f"{place}: it has no row")
         velocity = None if "velocity" not in entry else read_matrix(entry["velocity"], rows.height, self.size)
         return Output(name, unit, rows, velocity, None, where, during)
 

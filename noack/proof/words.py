@@ -8,11 +8,17 @@ from typing import Any
 _WIDTH = 108
 _DIGITS = 4
 _MS = 1000
+_NARROW = 1e-9
+"""Intervals that are narrower are shown as their middle."""
 _CLOCKS = {
     "zero": "the clock is set to 0",
     "keeps": "the clock goes on",
     "any": "the clock then has any value that is allowed there",
 }
+_READING = (
+    "Each location has a clock: it shows what the last edge has set it to, plus the time since; at the start "
+    "it shows 0. Numbers are rounded to four digits; [a, b] is any number from a to b."
+)
 Table = Mapping[str, Any]
 
 
@@ -45,13 +51,15 @@ def _lines(document: Table) -> Iterator[str]:
     if document.get("constant"):
         units.append(f"{document['constant']} = 1")
     yield f"Units of the bounds: {', '.join(units)}."
+    yield from _wrapped(_READING, [], "")
     yield from ("", "## Facts: Σ|left|² ≤ Σ|right|²")
     used = {name for fact in document["facts"].values() for name in (*fact["less"], *fact["more"])}
     for name, fact in document["facts"].items():
         left, right = (" + ".join(f"|{each}|²" for each in fact[side]) or "0" for side in ("less", "more"))
         yield from _wrapped(f"- {name!r}: {left} ≤ {right} ({fact['words']})", [], "")
     for name in sorted(used & {*document["rows"]}, key=list(document["rows"]).index):
-        yield from _wrapped(f"- where {name} = ", [_row(row, names) for row in document["rows"][name]], "; ")
+        shown = [_row(row, names) for row in document["rows"][name]] or ["0"]
+        yield from _wrapped(f"- where {name} = ", shown, "; ")
     for name, corners in document["motions"].items():
         yield from _motion(name, corners, document)
     if document.get("steps"):
@@ -104,7 +112,7 @@ def _equations(claim: Table) -> Iterator[str]:
 def _motion(name: str, corners: Sequence[Table], document: Table) -> Iterator[str]:
     mixture = f"any mixture of {len(corners)} corners, which may change at any time; corner 1:"
     yield from ("", f"## Motion {name!r}: {'exactly' if len(corners) == 1 else mixture}")
-    first = dict(_corner(corners[0], document))
+    first = dict(_corner(corners[0], document))  # an input is shown where it is an output
     for text in first.values():
         yield from _wrapped(f"- {text}", [], "")
     for number, corner in enumerate(corners[1:], 2):
@@ -122,8 +130,13 @@ def _corner(corner: Table, document: Table) -> Iterator[tuple[str, str]]:
         if names[i] not in still:
             rate = _row([*row, *signals], [*names, *(f"p{k}" for k in range(1, len(signals) + 1))])
             yield names[i], f"d/dt {names[i]} = {rate}"
+    for index in sorted(
+        {int(_value(output["input"])) for output in document["outputs"] if "input" in output}
+    ):
+        if index < len(corner["input"]):
+            yield f"input {index}", f"entry {index} of the input = {_row(corner['input'][index], names)}"
     for k, unknown in enumerate(corner["unknown"], 1):
-        sizes = "; ".join(_row(row, names) for row in unknown["rows"])
+        sizes = "; ".join(_row(row, names) for row in unknown["rows"]) or "0"
         along = ""
         if "along" in unknown:
             least = _number(unknown["least"])
@@ -149,11 +162,14 @@ def _edge(edge: Table, names: Sequence[str], inside: Sequence[str]) -> Iterator[
     changes, jump = [], edge.get("jump", [])
     has_steps = any(not isinstance(each, list) for each in jump)
     for i, row in enumerate([] if has_steps else jump):
-        is_changed = [_value(v) for v in row] != [int(i == j) for j in range(len(names))]
-        if is_changed and (names[i] in inside or any(map(_value, row))):
+        if not _is_unit(row, i) and (names[i] in inside or not all(map(_is_zero, row))):
             changes.append(f"{names[i]} := {_row(row, names)}")
-    target = "nowhere: proven to be never taken" if edge["to"] is None else repr(edge["to"])
+    target = (
+        "nowhere, so a proof has to show that it is never taken" if edge["to"] is None else repr(edge["to"])
+    )
     parts = [f"from {edge['from']!r} to {target}"]
+    if edge.get("event"):
+        parts.append("it counts as an event")
     if edge.get("when") is not None:
         first, last = edge["when"]
         when = _time(last) if _value(first) == _value(last) else f"{_time(first)} to {_time(last)}"
@@ -190,10 +206,9 @@ def _step(name: str, step: Table, document: Table) -> Iterator[str]:
     }
     changes = []
     for i, row in enumerate(step["matrix"]):
-        values = [_value(v) for v in row]
-        if name in flows and any(values):
+        if name in flows and not all(map(_is_zero, row)):
             changes.append(f"d/dt {names[i]} = {_row(row, names)}")
-        elif name not in flows and values != [int(i == j) for j in range(len(names))]:
+        elif name not in flows and not _is_unit(row, i):
             changes.append(f"{names[i]} := {_row(row, names)}")
     yield from _wrapped(f"- {name!r}: {step['words']}: ", changes or ["nothing changes"], ", ")
 
@@ -201,7 +216,7 @@ def _step(name: str, step: Table, document: Table) -> Iterator[str]:
 def _start(start: Table, names: Sequence[str], noise: Sequence[str]) -> Iterator[str]:
     values = []
     for name, row in zip(names, start["columns"], strict=True):
-        if name not in noise and any(map(_value, row)):
+        if name not in noise and not all(map(_is_zero, row)):
             values.append(f"{name} = {_row(row, ['', *noise])}")
     facts = f", if {_quoted(start['facts'])}," if start["facts"] else ""
     yield from _wrapped(f"- starts in {start['location']!r}{facts} with ", values, ", ")
@@ -226,9 +241,11 @@ def _row(row: Sequence[Any], names: Sequence[str]) -> str:
     """Return a combination such as "2 angle − 0.1 e angle"."""
     parts: list[str] = []
     for entry, name in zip(row, names, strict=True):
-        if (value := _value(entry)) == 0:
+        if _is_zero(entry):
             continue
-        size = "" if abs(value) == 1 and name else _number(abs(value))
+        value = abs(_value(entry)) if _is_wide(entry) else _value(entry)
+        size = _number(entry) if _is_wide(entry) else _number(abs(value))
+        size = "" if size == "1" and abs(value) == 1 and name else size
         sign = "−" if value < 0 else "+"
         term = " ".join(part for part in (size, name) if part)
         parts.append(f"{sign} {term}" if parts else f"{'−' if value < 0 else ''}{term}")
@@ -241,7 +258,28 @@ def _value(entry: Any) -> float:
     return float(Fraction(entry)) if isinstance(entry, str) else float(entry)
 
 
+def _is_wide(entry: Any) -> bool:
+    """Return whether an entry is an interval whose ends are shown."""
+    if not isinstance(entry, list):
+        return False
+    low, high = map(_value, entry)
+    return high - low > _NARROW * max(1.0, abs(low), abs(high))
+
+
+def _is_zero(entry: Any) -> bool:
+    return not _is_wide(entry) and _value(entry) == 0
+
+
+def _is_unit(row: Sequence[Any], index: int) -> bool:
+    """Return whether a row has a 1 at an index, and 0 elsewhere."""
+    return not any(map(_is_wide, row)) and [_value(v) for v in row] == [
+        int(index == j) for j in range(len(row))
+    ]
+
+
 def _number(entry: Any) -> str:
+    if _is_wide(entry):
+        return f"[{', '.join(map(_number, entry))}]"
     return f"{_value(entry):.{_DIGITS}g}".replace("-", "−")
 
 

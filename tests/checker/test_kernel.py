@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
@@ -226,6 +227,11 @@ def claim_a_limit(document: Table, proof: Table) -> None:
     proof["bounds"][0] |= {"from": "limit", "decay": 0.6}
 
 
+def have_no_row(document: Table, proof: Table) -> None:
+    """An output of nothing is 0, whatever its name says."""
+    document["outputs"][0]["rows"] = []
+
+
 def be_nowhere(document: Table, proof: Table) -> None:
     entry(document, "outputs", "all states")["in"] = []
 
@@ -305,6 +311,7 @@ FAULTS: dict[Change, str] = {
     leave_out_a_unit: "lacks is not 0",
     decay_faster: "not proven at motion/",
     claim_a_limit: "above twice the rate",
+    have_no_row: "it has no row",
     be_nowhere: "in no location",
     be_in_an_unknown_place: "unknown name",
     have_no_corner: "no corner",
@@ -564,3 +571,16 @@ def test_bounds_beyond_floating_point_are_rounded_outwards() -> None:
     """A float of such a number is infinite."""
     large = fmpq(13) * fmpq(10) ** 399
     assert str(root_above(large * large)) == "1.30001E+400"
+
+
+def test_an_interval_is_shown_with_its_ends() -> None:
+    """Also one around 0, and one around what changes nothing: the text hides nothing that may happen."""
+    document, _ = pendulum()
+    corner, edge = document["motions"]["driven"][0], entry(document, "edges", "0 lost, silent")
+    corner["matrix"][0][0] = [-2, 2]
+    edge["jump"][1][1] = [0.5, 1.5]
+    document["start"]["columns"][0][0] = [-0.25, 0.25]
+    text = re.sub(r"\s+", " ", in_words(document))
+    assert "- d/dt x0 = [−2, 2] x0 + x1 " in text
+    assert re.search(r"- '0 lost, silent': [^-]*; x1 := \[0\.5, 1\.5\] x1 - ", text)
+    assert "with x0 = [−0.25, 0.25]" in text
