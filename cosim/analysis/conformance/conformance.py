@@ -318,11 +318,11 @@ class _Checked:
 
     def _require_read(self, name: str, at: Numbers, rows: Matrix, recorded: Vector) -> None:
         found = recorded[self._trace.rows[at]]
-        known = np.isfinite(found).all(axis=1)
+        known = ~np.isnan(found).any(axis=1)
         at, found = at[known], found[known]
         z = self._z(at)
         room = STATE * (np.abs(found) + np.abs(z) @ np.abs(rows).T) + TINY * self._largest
-        near = np.abs(z @ rows.T - found) <= room
+        near = np.isfinite(found) & (np.abs(z @ rows.T - found) <= room)
         self._require(at, near.all(axis=1), Failed.READING, "", name)
 
     def edge_counts(self) -> dict[str, int]:

@@ -62,7 +62,8 @@ class Trace:
     u: Vector
     """(known states, m) The input as it was recorded, minus that of the reference for its time."""
     readings: dict[str, Vector]
-    """(known states, rows) each: what was recorded of x, and of x_s and x_c. NaN: nothing at this step."""
+    """(known states, rows) each: what was recorded of x, and of x_s and x_c. NaN: nothing at this step;
+    infinite: no number, where one belongs."""
     unknown: dict[str, Unknown] = field(default_factory=dict)
     """What happened at edges that the document lacks, by the name in ``names``."""
 
@@ -145,7 +146,7 @@ class _Tracer:
         """Return x_s at steps, (k, n), NaN where nothing is tested."""
         found, is_test = np.full((len(steps), self._n), np.nan), self._is_test[steps]
         rows = self._measured_at(steps[is_test])
-        found[is_test] = self._about(rows["x_s"], rows["t_ns"])
+        found[is_test] = _numbers(self._about(rows["x_s"], rows["t_ns"]))
         return found
 
     def _measured_at(self, steps: Indices) -> Rows:
@@ -207,7 +208,7 @@ class _Tracer:
         if ahead.any():
             back = Propagator(-self._document.H)
             moved[ahead] = back.advance_by(x_c[ahead], -ages_ns[ahead], self._period_ns)
-        found[known] = moved
+        found[known] = _numbers(moved)
         return found
 
     # The path.
@@ -475,6 +476,11 @@ class _RecordWalk:
         else:
             place = Place(False, False, event - now.acting)
         return self._taken(now, step * _STAGES + _TESTED, EdgeKind.EVENT, place)
+
+
+def _numbers(recorded: Vector) -> Vector:
+    """Return what was recorded; infinite where it is no number."""
+    return np.where(np.isnan(recorded), np.inf, recorded)
 
 
 def _within(columns: Vector, noise: Vector, limits: Vector) -> Vector:

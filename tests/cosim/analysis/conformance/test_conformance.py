@@ -219,6 +219,12 @@ def change_the_controllers_model(trace: Trace) -> None:
     trace.readings["x_c"][at[len(at) // 2]] *= 1.001
 
 
+def lose_the_sensors_model(trace: Trace) -> None:
+    after = np.flatnonzero(trace.is_motion) + 1
+    at = after[np.isfinite(trace.readings["x_s"][after, 0])]
+    trace.readings["x_s"][at[len(at) // 2]] = np.inf
+
+
 WRONG: dict[Callable[[Trace], None], set[Failed]] = {
     leave_out_a_step: {Failed.PATH, Failed.CLOCK, Failed.EDGE, Failed.MOTION},
     forget_a_state: {Failed.PATH, Failed.MOTION, Failed.JUMP, Failed.READING},
@@ -227,6 +233,7 @@ WRONG: dict[Callable[[Trace], None], set[Failed]] = {
     change_an_input: {Failed.MOTION, Failed.INPUT},
     leave_out_the_states: {Failed.READING},
     change_the_sensors_model: {Failed.READING},
+    lose_the_sensors_model: {Failed.READING},
     change_the_controllers_model: {Failed.READING},
 }
 
@@ -238,6 +245,19 @@ def test_a_wrong_trace_is_refuted(traced: tuple[Trace, Table], change: Callable[
     found = compare(trace, DocumentNumbers(traced[1]))
     assert found.failure is not None
     assert found.failure.kind in WRONG[change], found.failure
+
+
+@pytest.mark.parametrize("table", ["measured", "ticks"])
+def test_a_recorded_model_that_is_no_number_is_refuted(table: str) -> None:
+    recorded = RecordedLoop(simulate(resolved("double_integrator", "horizon_s=1")))
+    document = document_of_scenario("double_integrator")
+    assert compare(trace_of(recorded, document), document.numbers).conforms
+    rows = getattr(recorded, table).copy()
+    rows["x_s" if table == "measured" else "x_c"][len(rows) // 2] = np.nan
+    setattr(recorded, table, rows)
+    failure = compare(trace_of(recorded, document), document.numbers).failure
+    assert failure is not None
+    assert failure.kind is Failed.READING
 
 
 OTHERS = {"dc_motor_load": 0.05, "lane_periodic": 0.05, "reactor_petc": 0.05, "servo_reference": 1.0}
