@@ -284,9 +284,8 @@ def _print_bursts(console: Console, bursts: BurstPrediction, with_cap: float | N
     mean = f"{bursts.mean_burst:.3g} packets long on average" if bursts.mean_burst else "endless"
     behind = "" if with_cap is None else f"; with the guarantee {with_cap:.3g}"
     console.print(Text(f"loss bursts without a guarantee: {mean}{behind}"))
-    console.print(
-        Text(f"chance that within {bursts.packets} packets more than N are lost in a row, without a guarantee:")
-    )
+    chance = f"chance that within {bursts.packets} packets more than N are lost in a row"
+    console.print(Text(f"{chance}, without a guarantee:"))
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, show_header=False)
     table.add_row("  N", *map(str, bursts.chance))
     table.add_row("  chance", *map(chance_text, bursts.chance.values()))
