@@ -96,7 +96,7 @@ sensor: setup ## The sensor: model x_s and trigger
 controller: setup ## The controller: model x_c, input u = K x_c
 	@$(BIN)/noack controller --session $(SESSION) $(ARGS)
 
-netem: setup ## The network: loses at most M - 1 consecutive packets
+netem: setup ## The network: loses at most mansd packets in a row
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack

@@ -87,6 +87,6 @@ for case in (scenario, harsh):
     t_s, angle = samples["t_s"].to_numpy(), samples["x_1"].to_numpy()
     settled_s = t_s[np.abs(angle) > 0.01].max()
     print(
-        f"M - 1 = {case.network.mansd}: {run.summary.loops[0].events} events, "
+        f"at most {case.network.mansd} lost in a row: {run.summary.loops[0].events} events, "
         f"{run.summary.loops[0].deliveries} received, upright after {settled_s:.2f} s"
     )

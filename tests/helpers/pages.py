@@ -13,7 +13,7 @@ PAGES = (
     "README.md", "docs/record.md", "docs/scenarios.md", "docs/network.md", "docs/many-loops.md",
     "docs/paper.md", "docs/netem.md", "docs/netem-programs.md", "docs/campaigns.md",
     "docs/design.md", "docs/plants.md", "docs/library.md", "docs/command-line.md", "docs/howto.md",
-    "docs/guarantees.md", "docs/benchmarks.md", "docs/measure.md", "docs/choosing-m.md",
+    "docs/guarantees.md", "docs/benchmarks.md", "docs/measure.md", "docs/choosing-mansd.md",
     "docs/papers.md", "docs/published.md", "docs/theory.md",
 )  # fmt: skip
 

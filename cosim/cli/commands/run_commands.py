@@ -161,7 +161,7 @@ def set_(
     ] = None,
     json: opt.JsonOption = False,
 ) -> None:
-    """Change a live run: losses, M, trigger, set point."""
+    """Change a live run: losses, mansd, trigger, set point."""
     opt.require_linux()
     from cosim.cli.live_settings import parse_settings, print_parameters
     from noack.runtime.active_runs import find_run, request_change

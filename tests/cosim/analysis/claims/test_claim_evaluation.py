@@ -58,7 +58,7 @@ def test_the_docs_list_every_claim_of_the_catalogue() -> None:
     section = text[text.index("\n## Claims") : text.index("\n## The summary")]
     table_rows = [line.strip("| ").split(" | ") for line in section.splitlines() if " | " in line]
     of_guarantee = (
-        "each rule of the guarantee, as *at most M − 1 = 4 consecutive losses*",
+        "each rule of the guarantee, as *at most 4 lost in a row*",
         "network",
         "nothing",
     )
