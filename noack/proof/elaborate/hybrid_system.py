@@ -33,7 +33,7 @@ more with y² = max(η, 0), as it will be at the next test. It is the same until
 e^{−λT} η + (1 − e^{−λT})/λ zᵀΨz. So y² becomes 0, or at most this with y² for η: V does not grow in either
 case, with coefficients of y² that are at least 0.
 
-At most M − 1 consecutive updates are lost, and at most ``later`` events are assumed to happen within d
+At most ``losses`` consecutive updates are lost, and at most ``later`` events are assumed to happen within d
 after an event. :mod:`.proof` shows both assumptions from bounds of the same loop, by induction over the
 events.
 

@@ -174,7 +174,7 @@ class Loop(NamedTuple):
     sizes: tuple[arb, ...]  # |d_i| ≤ sizes[i]
     noise: arb_mat
     """Columns of the noise of tests, (n, k), or (p, k) of p outputs: Σ column p with |p_i| ≤ 1 for each."""
-    losses: int  # most consecutive losses, M − 1
+    losses: int  # most updates lost in a row
     times: Times
     observer: LoopObserver | None = None
     outputs: arb_mat = zeros(0, 0)

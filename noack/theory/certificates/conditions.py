@@ -41,7 +41,7 @@ class NetworkConditions(NamedTuple):
     """
 
     dropouts: int
-    """The largest number of consecutive losses: M − 1, or less by further constraints."""
+    """At most this number of updates is lost in a row: mansd, or less by further constraints."""
     sampling_s: float = 0.0
     """h, the longest time between two tests of the trigger; 0 is a continuous trigger."""
     spacing_s: float = 0.0
@@ -161,7 +161,7 @@ def allowed_conditions(resolved: Scenario) -> NetworkConditions:
 def ideal_conditions(resolved: Scenario) -> NetworkConditions:
     """The paper's conditions: a continuous trigger, a network and input without delay.
 
-    The guarantee gives the longest burst of losses, and its rules except the cap M − 1.
+    The guarantee gives the longest burst of losses, and its rules except ``mansd``.
     """
     guarantee = resolved.network.guarantee
     assert guarantee.longest_burst is not None  # a scenario has a cap

@@ -138,7 +138,7 @@ def witness_by_gains(loop: Loop, outputs: Sequence[str]) -> Witness:
 def _by_forms(loop: Loop, wanted: "_Wanted", effort: Effort) -> Witness:
     """Return a witness with quadratic forms."""
     if loop.losses > _MOST_LOSSES:
-        raise NoWitnessError(f"M − 1 = {loop.losses} consecutive losses: at most {_MOST_LOSSES} are searched")
+        raise NoWitnessError(f"{loop.losses} lost in a row: a search covers at most {_MOST_LOSSES}")
     rates = _Rates(loop)
     if rates.slowest <= 0:
         raise NoWitnessError("the loop does not decay without losses")
