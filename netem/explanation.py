@@ -284,7 +284,7 @@ def _print_bursts(console: Console, bursts: BurstPrediction, with_cap: float | N
     mean = f"{bursts.mean_burst:.3g} packets long on average" if bursts.mean_burst else "endless"
     behind = "" if with_cap is None else f"; with the guarantee {with_cap:.3g}"
     console.print(Text(f"loss bursts without a guarantee: {mean}{behind}"))
-    chance = f"chance that within {bursts.packets} packets more than N are lost in a row"
+    chance = f"chance of more than N in a row within {bursts.packets} packets"
     console.print(Text(f"{chance}, without a guarantee:"))
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, show_header=False)
     table.add_row("  N", *map(str, bursts.chance))

@@ -176,7 +176,7 @@ def test_the_emulator_with_measure_measures(measuring: Installed) -> None:
     assert document["effective_losses"] == 7
     shown = measuring(*words)
     assert shown.returncode == 0, shown.stderr
-    assert "urban_n78_40kmh: M = 5" in shown.stdout
+    assert "urban_n78_40kmh: at most 4 lost in a row" in shown.stdout
 
 
 def test_the_emulator_with_measure_predicts(measuring: Installed) -> None:

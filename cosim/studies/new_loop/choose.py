@@ -25,7 +25,7 @@ from cosim.studies.new_loop.trial_scenario import (
     content_of,
     scenario_of,
 )
-from cosim.studies.new_loop.trials import Trial
+from cosim.studies.new_loop.trials import LoopTrial
 from netem.core.errors import CallerError
 from netem.core.number_format import to_digits
 from noack.core.linear_systems import norm
@@ -44,9 +44,9 @@ _LOOSE_BOUND_RATIO = 200.0
 """A bound of ‖x‖ above this multiple of ‖x(0)‖ is used only if there is no other."""
 
 
-def best_trial(choices: Choices, trials: Sequence[Trial], report: Report) -> Trial:
+def best_trial(choices: Choices, trials: Sequence[LoopTrial], report: Report) -> LoopTrial:
     """Return the trial that is used."""
-    candidates: list[tuple[float, Trial]] = []
+    candidates: list[tuple[float, LoopTrial]] = []
     if trials[0].has_friction and choices.allowed:
         return trials[0]  # only a proof about the plant itself counts
     contents = set[str]()
@@ -70,7 +70,7 @@ def best_trial(choices: Choices, trials: Sequence[Trial], report: Report) -> Tri
     return _with_input_norm(choices, trials[0])
 
 
-def _with_input_norm(choices: Choices, trial: Trial) -> Trial:
+def _with_input_norm(choices: Choices, trial: LoopTrial) -> LoopTrial:
     """Return a trial with the norm that counts errors by what they do to the input, if that certifies it."""
     model, K = trial.gain.model, trial.gain.K
     if trial.gain.integrals or trial.weight is not None:  # W is of the states alone
@@ -83,7 +83,7 @@ def _with_input_norm(choices: Choices, trial: Trial) -> Trial:
     return trial
 
 
-def certificate_of(choices: Choices, trial: Trial) -> ScenarioCertificate:
+def certificate_of(choices: Choices, trial: LoopTrial) -> ScenarioCertificate:
     """Return the certificate of a trial's linear plant that needs no search, perhaps void."""
     resolved = resolve(scenario_of(choices, trial))
     if not resolved.coverage.is_linear:
@@ -95,7 +95,7 @@ def certificate_of(choices: Choices, trial: Trial) -> ScenarioCertificate:
     return quick_certificate(resolved)
 
 
-def returns_to_rest(choices: Choices, trial: Trial) -> bool:
+def returns_to_rest(choices: Choices, trial: LoopTrial) -> bool:
     """Return whether the loop settles in virtual time, as the verdict of a run has it.
 
     Raises:
@@ -116,7 +116,7 @@ class TrialProofs:
         self.choices = choices
         self._near: Sequence[Mapping[str, object]] = ()
 
-    def of(self, trial: Trial) -> Certificates:
+    def of(self, trial: LoopTrial) -> Certificates:
         """Return the certificates of a trial, with the bounds that are proven."""
         results = certificates_of(scenario_of(self.choices, trial))
         most_work = 2 * RUN_WORK if self.choices.is_linear else MOST_WORK
@@ -126,7 +126,7 @@ class TrialProofs:
         return results
 
 
-def with_threshold(choices: Choices, trial: Trial, report: Report) -> tuple[Trial, Certificates]:
+def with_threshold(choices: Choices, trial: LoopTrial, report: Report) -> tuple[LoopTrial, Certificates]:
     """Return the trial with the last threshold that the allowed errors need, and its certificates.
 
     A bound that does not decay is proportional to this threshold, where nothing disturbs the plant. In the
@@ -152,7 +152,7 @@ def with_threshold(choices: Choices, trial: Trial, report: Report) -> tuple[Tria
     return trial, results
 
 
-def _better_floor(choices: Choices, trial: Trial, results: Certificates) -> float | None:
+def _better_floor(choices: Choices, trial: LoopTrial, results: Certificates) -> float | None:
     """Return the last threshold with which bounds become 85 % of the allowed errors; None: keep it."""
     used = results.scenario.trigger
     is_free = choices.leaves("trigger", "trigger.floor") and isinstance(used, DecayingSettings)
@@ -178,8 +178,8 @@ def largest_share(results: Certificates) -> float:
 
 
 def _with_proof(
-    choices: Choices, trial: Trial, proofs: TrialProofs, report: Report
-) -> tuple[Trial, Certificates]:
+    choices: Choices, trial: LoopTrial, proofs: TrialProofs, report: Report
+) -> tuple[LoopTrial, Certificates]:
     """Return the first trial of this one and easier ones with proven bounds, else this one."""
     report("searching for proofs")
     first = trial, proofs.of(trial)
@@ -193,7 +193,7 @@ def _with_proof(
     return first
 
 
-def _easier_trials(choices: Choices, trial: Trial) -> Iterator[Trial]:
+def _easier_trials(choices: Choices, trial: LoopTrial) -> Iterator[LoopTrial]:
     """Yield trials of which more is proven: with a smaller or slower threshold, and fewer losses."""
     used = scenario_of(choices, trial).trigger
     if isinstance(used, DecayingSettings) and not trial.has_friction and not choices.is_linear:

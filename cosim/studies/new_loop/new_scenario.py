@@ -27,7 +27,7 @@ from cosim.studies.new_loop.scenario_text import file_text
 from cosim.studies.new_loop.trial_scenario import POLICY, content_of, scenario_of
 from cosim.studies.new_loop.trials import (
     DEFAULT_START,
-    Trial,
+    LoopTrial,
     input_weights,
     largest_sizes,
     list_trials,
@@ -164,7 +164,7 @@ def new(
     )
 
 
-def _with_smaller_start(choices: Choices, trial: Trial) -> tuple[Trial, bool]:
+def _with_smaller_start(choices: Choices, trial: LoopTrial) -> tuple[LoopTrial, bool]:
     """Halve x(0), at most five times, until the loop returns to rest; return also whether it does."""
     returns = returns_to_rest(choices, trial)
     for _ in range(5):

@@ -6,7 +6,7 @@ import numpy as np
 
 from cosim.analysis.certificates import Certificates
 from cosim.output.guarantee_sentence import guarantee_sentence, is_within_allowed
-from cosim.studies.new_loop.trials import Trial
+from cosim.studies.new_loop.trials import LoopTrial
 from noack.core.linear_systems import Vector
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
@@ -39,7 +39,7 @@ def bound_notes(results: Certificates, start: Vector) -> Iterator[str]:
 
 
 def loop_notes(
-    trial: Trial, certificate: ScenarioCertificate, returns: bool, *, of_plant: bool
+    trial: LoopTrial, certificate: ScenarioCertificate, returns: bool, *, of_plant: bool
 ) -> Iterator[str]:
     """Yield what was chosen and found, a sentence each; ``of_plant``: a guarantee is for the plant itself."""
     yield f"u = K x_c: {trial.gain.method}; without errors x decays as e^(−{trial.gain.decay_per_s:.3g}t)."
@@ -75,7 +75,7 @@ _SMALL_EFFECT = 0.1
 """With a smaller entry of B, per second, the weights 1 of a state and of an input give a slow loop."""
 
 
-def input_notes(trial: Trial) -> Iterator[str]:
+def input_notes(trial: LoopTrial) -> Iterator[str]:
     """Yield what to do if the regulator, which weighs inputs like states, hardly uses an input."""
     effect = float(np.abs(trial.gain.model.B).max(initial=0.0))
     if not trial.has_friction and 0 < effect < _SMALL_EFFECT:

@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 
 from cosim.studies.new_loop.linear_model import eigenvalue_text
-from cosim.studies.new_loop.trials import Trial
+from cosim.studies.new_loop.trials import LoopTrial
 from netem.core.settings_section import ReadTable
 from noack.scenario.scenario_file import toml_text
 
@@ -35,7 +35,7 @@ _REASONS = {
 """How values are chosen that are not given."""
 
 
-def file_text(content: ReadTable, notes: Sequence[str], trial: Trial, fixed_settings: ReadTable) -> str:
+def file_text(content: ReadTable, notes: Sequence[str], trial: LoopTrial, fixed_settings: ReadTable) -> str:
     """Return the file: the content with comments."""
     poles, decay = eigenvalue_text(trial.gain.eigenvalues), trial.gain.decay_per_s
     comments = _COMMENTS | {

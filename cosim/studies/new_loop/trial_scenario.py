@@ -7,7 +7,7 @@ import numpy as np
 
 from cosim.studies.new_loop import BETA_SHARE, DEFAULT_LOSS_PROBABILITY, HORIZON_DECAY
 from cosim.studies.new_loop.choices import Choices
-from cosim.studies.new_loop.trials import Trial
+from cosim.studies.new_loop.trials import LoopTrial
 from netem.core.number_format import to_digits
 from netem.core.settings_section import Table
 from noack.core.linear_systems import Matrix, norm
@@ -20,12 +20,12 @@ SMALL_FLOOR_SHARE, LARGEST_FLOOR_SHARE = 0.05, 0.5
 """The last threshold as a share of beta: without allowed errors, and at most for them."""
 
 
-def scenario_of(choices: Choices, trial: Trial) -> Scenario:
+def scenario_of(choices: Choices, trial: LoopTrial) -> Scenario:
     """Return the loaded scenario of a trial."""
     return completed(content_of(choices, trial), choices.path)
 
 
-def content_of(choices: Choices, trial: Trial) -> Table:
+def content_of(choices: Choices, trial: LoopTrial) -> Table:
     """Return the content of a trial's scenario file."""
     model, plant = choices.model, choices.model.plant
     start = trial.x0 if trial.weight is None else trial.weight @ trial.x0
@@ -72,7 +72,7 @@ def content_of(choices: Choices, trial: Trial) -> Table:
     return content
 
 
-def _horizon_and_speed(trial: Trial) -> tuple[float, float]:
+def _horizon_and_speed(trial: LoopTrial) -> tuple[float, float]:
     """Return how long a run lasts, in s, and the simulated time per wall time of a live run.
 
     At the end the threshold has decayed, and what is guaranteed has begun for a while. A run of less than
@@ -95,7 +95,7 @@ def _rows(weight: Matrix) -> list[list[float]]:
     return [[to_digits(entry, 6) for entry in row] for row in weight]
 
 
-def _first_floor(choices: Choices, trial: Trial, beta: float) -> float:
+def _first_floor(choices: Choices, trial: LoopTrial, beta: float) -> float:
     """Return the last threshold that is tried first.
 
     With friction it is a share of the first allowed error.

@@ -24,7 +24,7 @@ DEFAULT_START = 0.1
 
 
 @dataclass(frozen=True)
-class Trial:
+class LoopTrial:
     """A loop with settings that are tried together."""
 
     gain: LoopGain
@@ -41,7 +41,9 @@ class Trial:
     """When all outputs are guaranteed to stay within their allowed errors."""
 
 
-def list_trials(model: LinearModel | LoopGain, x0: Vector, allowed: Mapping[str, float]) -> Iterator[Trial]:
+def list_trials(
+    model: LinearModel | LoopGain, x0: Vector, allowed: Mapping[str, float]
+) -> Iterator[LoopTrial]:
     """Yield what is tried, the preferred settings first; states without an allowed error may move.
 
     Raises:
@@ -66,7 +68,7 @@ def list_trials(model: LinearModel | LoopGain, x0: Vector, allowed: Mapping[str,
             for mansd in range(DEFAULT_MANSD, 0, -1):
                 for share in shares:
                     alpha_per_s = to_digits(min(share * loop_gain.decay_per_s, fastest_per_s))
-                    yield Trial(loop_gain, rate_hz, mansd, alpha_per_s, x0, weight, has_friction)
+                    yield LoopTrial(loop_gain, rate_hz, mansd, alpha_per_s, x0, weight, has_friction)
 
 
 _INPUT_WEIGHTS = (1.0, 10.0, 100.0)

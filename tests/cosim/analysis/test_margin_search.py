@@ -127,7 +127,7 @@ def test_stronger_and_weaker_guarantees_are_compared_with_the_scenarios() -> Non
     assert weaker.stability.verdict == "destabilised"
     assert stronger.stability.upper <= own.stability.upper <= weaker.stability.upper
     first, second, third = margin.compared.relations
-    cap, window = "at most M − 1 = 4 consecutive losses", "at most 6 losses in 7"
+    cap, window = "at most 4 lost in a row", "at most 6 losses in 7"
     assert first.startswith(f"“{cap}” implies “{window}")
     assert first.endswith("which also allows LLLLL")
     assert second.endswith(f"implies “{cap}”, which also allows LDL")

@@ -18,10 +18,10 @@ def words_of(text: str) -> str:
 
 def test_a_margin_names_the_ties() -> None:
     """13 losses are proven with early arrivals alone, and are false of a live run."""
-    result = invoke("margin", CASES / "drive_tie.toml", "--most", "2")
+    result = invoke("margin", CASES / "drive_tie.toml", "--most", "1")
     text = words_of(result.stdout)
     assert result.exit_code == 0
-    assert "proven stable for every loss pattern with M ≤ 2" in text
+    assert "proven stable for every loss pattern with at most 1 lost in a row" in text
     assert "arrives within 0.2 ms of a tick of the controller: it may act at this tick or at the next" in text
     assert "each update at whichever of two ticks, every pattern is stable" in text
     assert "stable in mean square (computed, each update at the later of its ticks)" in text
@@ -30,9 +30,9 @@ def test_a_margin_names_the_ties() -> None:
 def test_no_run_plays_a_pattern_whose_ticks_it_cannot_choose() -> None:
     delay = 'network.impairments=[{kind="delay", delay_s=0.005}]'
     unstable = ("--set", "model.gain=[[-0.5, 0.0, 0.6]]", "--set", delay)
-    result = invoke("margin", CASES / "drive_tie.toml", "--most", "1", "--play", *unstable)
+    result = invoke("margin", CASES / "drive_tie.toml", "--most", "0", "--play", *unstable)
     assert result.exit_code != 0
-    assert "this pattern destabilises M = 1" in words_of(result.stdout)
+    assert "with 0 lost in a row this pattern destabilises" in words_of(result.stdout)
     assert "noack: --play: no run can choose the ticks of the pattern: an update arrives" in result.stderr
 
 
@@ -53,7 +53,7 @@ def test_a_timeout_of_updates_has_these_answers(tmp_path: Path, monkeypatch: pyt
     case = CASES / "drive_timeout.toml"
     simulated = invoke("simulate", case, "--set", "horizon_s=1.0", "--no-report")
     assert (simulated.exit_code, NEXT_TICK in simulated.stderr) == (0, True)
-    margin = invoke("margin", case, "--most", "4", "--no-period")
+    margin = invoke("margin", case, "--most", "3", "--no-period")
     assert margin.exit_code == 0
     assert "with at most 3 lost in a row, inputs up to 2 steps late" in words_of(margin.stdout)
     refusals = {

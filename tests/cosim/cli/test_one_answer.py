@@ -40,7 +40,7 @@ def test_the_answer_of_certify_is_that_of_margin(period_s: float, losses: int) -
     margin = noack.margin(scenario, most_mansd=0, period=False)
     assert margin.certificate == answer
     assert str(margin).splitlines()[-1] == (
-        f"noack certify --no-search, for at most M − 1 = {losses} consecutive losses: {answer.text}"
+        f"noack certify --no-search, for at most {losses} lost in a row: {answer.text}"
     )
 
 

@@ -42,7 +42,7 @@ def test_json_tables_and_page_have_the_same_numbers(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     words = (RURAL, "--deadline", "100ms", "--for", "lane_following", "--window", 20)
     document = json.loads(measure(*words, "--json", "--out", page).stdout)
-    assert (document["packets"], document["late"], document["M"]) == (2178, 616, 49)
+    assert (document["packets"], document["late"], document["mansd"]) == (2178, 616, 48)
     assert document["windows"] == {"20": {"most_losses": 20, "without_outages": 20}}
     assert sum(int(n) * count for n, count in document["histogram"].items()) == 616
     assert document["certificate"]["share"] == pytest.approx(0.57, abs=0.01)
@@ -92,11 +92,11 @@ def test_a_network_without_losses_is_measured(tmp_path: Path) -> None:
     path.write_text("sent_ms,received_ms\n0,1\n")
     for words in ((), ("--out", tmp_path / "a.html"), ("--write", tmp_path / "a.toml")):
         document = measure(path, "--for", "lane_following", "--json", *words)
-        assert json.loads(document.stdout)["M"] == 1
+        assert json.loads(document.stdout)["mansd"] == 0
     path.write_text("sent_ms,received_ms\n0,\n5,\n")
     for words in ((), ("--out", tmp_path / "a.html")):
         document = json.loads(measure(path, "--json", *words).stdout)
-        assert (document["lost"], document["M"], document["delay_s"]) == (2, 3, {})
+        assert (document["lost"], document["mansd"], document["delay_s"]) == (2, 2, {})
 
 
 def test_the_chance_of_a_long_burst_is_that_of_the_fitted_chain(chain_csv: Path) -> None:
@@ -183,7 +183,7 @@ def test_a_measured_preset_is_a_network_of_the_emulator(
 
 def test_a_report_of_iperf3_says_what_its_intervals_say() -> None:
     text = " ".join(measure(TRACES / "iperf3_receiver.json").output.split())
-    assert "3.0 % lost, M is at least 2" in text
+    assert "3.0 % lost, at least 1 in a row" in text
     assert "iperf3 counts losses per interval, not per packet" in text
     document = json.loads(measure(TRACES / "iperf3_sender.json", "--json").stdout)
     assert [stream["stream"] for stream in document["streams"]] == [2, 1]  # the worst first
@@ -228,7 +228,7 @@ def test_all_flows_of_a_capture_are_rows_and_the_worst_is_the_first(tmp_path: Pa
     assert [flow["flow"] for flow in document["flows"]] == [3, 2, 1]  # numbered by their packets
     # The same numbers as those of the flow alone.
     alone = json.loads(measure(capture, "--sequence-at", "0:2", "--flow", "3", "--json").stdout)
-    assert (alone["effective_losses"], alone["M"]) == (100, document["flows"][0]["M"])
+    assert (alone["effective_losses"], alone["mansd"]) == (100, document["flows"][0]["mansd"])
     refused = measure(capture, "--flows")
     assert refused.exit_code == 2
     assert "no flow can be measured; flow 1: has one end only" in refused.output

@@ -10,11 +10,12 @@ from unittest.mock import patch
 
 import tomli_w
 
+from netem.control.command_queue import AppliedSettings
 from netem.control.control_routes import ControlRoutes, LinkChange
 from netem.core.errors import CallerError
 from netem.explanation import tc_command
 from netem.impairments.kinds.delay import SHAPES
-from netem.impairments.link_settings import LinkSettings
+from netem.impairments.link_settings import Counters, LinkSettings
 from netem.links_file import json_schema, load_links
 from netem.relay.relay_reports import DIRECTIONS
 from netem.tc_words import EXAMPLES as ANY_WORD
@@ -174,7 +175,10 @@ class _AtOnce:
             self.relay.change(link, direction, settings)
 
     def snapshot(self) -> Any:
-        return SimpleNamespace(links=self.relay.report())
+        applied = {
+            key: AppliedSettings(settings, Counters()) for key, settings in self.relay.settings.items()
+        }
+        return SimpleNamespace(links=self.relay.report(), applied=applied)
 
 
 def control_input(choices: Choices) -> None:

@@ -56,7 +56,7 @@ def test_the_terminal_begins_with_the_sentence_of_the_page(tmp_path: Path) -> No
     page = tmp_path / "page.html"
     words = ("--sequence-at", "0:4", "--out", page)
     lines = invoke("measure", CASES / "iperf2_end.pcap.gz", *words).stdout.splitlines()
-    assert lines[0].endswith("iperf2_end.pcap.gz: M = 4")
-    sentence = "At most M − 1 = 3 consecutive packets were not effectively delivered."
+    assert lines[0].endswith("iperf2_end.pcap.gz: at most 3 lost in a row")
+    sentence = "At most 3 packets in a row were not effectively delivered."
     assert lines[1] == sentence
     assert sentence in page.read_text()

@@ -15,7 +15,7 @@ from cosim.studies.new_loop import choose, new_scenario
 from cosim.studies.new_loop.choices import Choices
 from cosim.studies.new_loop.linear_model import controllable_states
 from cosim.studies.new_loop.trial_scenario import scenario_of
-from cosim.studies.new_loop.trials import Trial
+from cosim.studies.new_loop.trials import LoopTrial
 from netem.core.errors import CallerError
 from noack.plants.systems import linearisation
 from noack.scenario.outputs import LoopOutput
@@ -117,10 +117,7 @@ def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
     command("linearise", "pole.py:Pole", "--out", "pole.json")
     command("gain", "pole.json", "--r", "2", "--out", "pole.json")
     text = command("new", "pole.json", "--out", "loop.toml").stdout
-    assert (
-        "Certified for the linear plant ẋ = Âx + B̂u, for every pattern of losses with at most M − 1 = "
-        in text
-    )
+    assert "Certified for the linear plant ẋ = Âx + B̂u, for every pattern of losses with at most " in text
     document = json.loads(Path("pole.json").read_text())
     expected = [[0, 1, 0, 0], [0, 0, -0.981, 0], [0, 0, 0, 1], [0, 0, 21.582, 0]]
     np.testing.assert_allclose(document["A"], expected, rtol=1e-9)
@@ -170,7 +167,7 @@ def test_a_loop_that_is_not_certified_with_the_fewest_losses_is_not_tried_with_m
     """Late inputs: nothing is certified. Of each of 3 gains and 2 rates, two loops are tried instead of 8."""
     tried, certificate_of = list[tuple[str, float, int]](), choose.certificate_of
 
-    def counted(choices: Choices, trial: Trial) -> ScenarioCertificate:
+    def counted(choices: Choices, trial: LoopTrial) -> ScenarioCertificate:
         tried.append((trial.gain.method, trial.rate_hz, trial.mansd))
         return certificate_of(choices, trial)
 
@@ -247,9 +244,9 @@ def test_a_guarantee_is_kept_if_nothing_is_proven_with_a_larger_threshold(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     Path("servo.py").write_text(SERVO)
-    prove, tried = choose.TrialProofs.of, list[Trial]()
+    prove, tried = choose.TrialProofs.of, list[LoopTrial]()
 
-    def only_the_first(proofs: choose.TrialProofs, trial: Trial) -> Certificates:
+    def only_the_first(proofs: choose.TrialProofs, trial: LoopTrial) -> Certificates:
         tried.append(trial)
         return prove(proofs, trial) if len(tried) == 1 else Certificates(scenario_of(proofs.choices, trial))
 
@@ -266,7 +263,7 @@ def test_the_written_settings_are_simulated(monkeypatch: pytest.MonkeyPatch) -> 
     Path("servo.py").write_text(SERVO)
     simulated = list[noack.Scenario]()
 
-    def noted(choices: Choices, trial: Trial) -> bool:
+    def noted(choices: Choices, trial: LoopTrial) -> bool:
         simulated.append(scenario_of(choices, trial))
         choose.returns_to_rest(choices, trial)
         return len(simulated) == 1
