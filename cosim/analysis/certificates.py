@@ -5,10 +5,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
-from cosim.analysis.allowed_errors import ThresholdTrials
 from cosim.analysis.certificate_rows import certificate_rows, covered_plants
 from cosim.analysis.scenario_certificates import certificate_of
-from cosim.analysis.tried_settings import TriedSettings, helpful_box, helpful_settings, largest_settings
+from cosim.analysis.settings_with_certificates import (
+    TriedSettings,
+    helpful_box,
+    helpful_settings,
+    largest_settings,
+)
+from cosim.analysis.threshold_suggestions import ThresholdTrials
 from cosim.analysis.witnesses import Unproven, Witnesses, find_witnesses, with_lateness
 from netem.core.errors import CallerError
 from netem.core.number_checks import whole_number

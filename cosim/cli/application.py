@@ -17,7 +17,7 @@ from typer.core import TyperGroup
 from typer.main import get_command_name, get_group
 
 from cosim.cli.options import PANELS, examples
-from cosim.live.monitoring.line_times import lines_of_command
+from cosim.live.monitoring.progress_lines import lines_of_command
 from netem.core.command_line import StopRequestError, report_failure, stop_requests_raised, why_not_written
 from netem.core.errors import CallerError, ExitStatus, NoackError, plain_mistake, printable, why
 from netem.core.extension_points import missing_extension, parts

@@ -11,7 +11,7 @@ from cosim.analysis.certificate_rows import certificate_rows, covered_plants
 from cosim.analysis.certificates import IDEAL, SCHEDULE, Certificates, state_norm
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
-from cosim.analysis.tried_settings import MOST_S, TriedSettings
+from cosim.analysis.settings_with_certificates import MOST_S, TriedSettings
 from cosim.output.guarantee_sentence import although_lost, guarantee_sentence, is_within_allowed
 from cosim.output.run_document import assumption_table
 from cosim.simulation.sampled_loop import SampledLoop

@@ -21,8 +21,8 @@ from netem.core.file_access import move, open_folder
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
-from noack.runtime.kept_rows import KeptHead, KeptPart, read_kept
 from noack.runtime.spool import KEPT_REPORT, SPOOL, SpoolWriter, notices_of, writer_of
+from noack.runtime.unsent_rows_file import KeptHead, KeptPart, read_kept
 
 T = TypeVar("T")
 

@@ -58,10 +58,10 @@ from noack.runtime.drivers.live_driver import LiveDriver, LoopSockets
 from noack.runtime.drivers.real_time_loop import Driver, ProcessSockets, run_loop
 from noack.runtime.end_reasons import HORIZON, LAUNCHER_GONE, LOST_AFTER_S
 from noack.runtime.host_clocks import RECEIVED, CausalityCheck, clock_error, realtime_offset_ns
-from noack.runtime.kept_rows import KeptFile, KeptHead
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.runtime.spool import SPOOL
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
+from noack.runtime.unsent_rows_file import KeptFile, KeptHead
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario_checks import prepare_changes

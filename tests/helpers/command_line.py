@@ -8,7 +8,7 @@ import typer.testing
 from typer.testing import CliRunner, Result
 
 from cosim.cli.application import app
-from cosim.live.monitoring import line_times
+from cosim.live.monitoring import progress_lines
 
 # The commands are built from their signatures once, not for each invocation (0.05 s of CPU).
 typer.testing._get_command = cache(typer.main.get_command)
@@ -21,7 +21,7 @@ def invoke(*words: object) -> Result:
     Lines about long work are left out: a busy machine would print some.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(line_times, "LINE_EVERY_S", _NEVER_S)
-        patch.setattr(line_times, "FIRST_LINE_S", _NEVER_S)
+        patch.setattr(progress_lines, "LINE_EVERY_S", _NEVER_S)
+        patch.setattr(progress_lines, "FIRST_LINE_S", _NEVER_S)
         patch.setattr("sys.argv", ["noack", *map(str, words)])
         return CliRunner().invoke(app, [str(word) for word in words], prog_name="noack")

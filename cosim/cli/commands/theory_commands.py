@@ -383,8 +383,8 @@ def margin(
         raise CallerError(f"--play: no destabilising pattern was found with up to {most} lost in a row")
     if result.ties:
         raise CallerError(f"--play: no run can choose the ticks of the pattern: {result.ties}")
+    from cosim.cli.destabilising_run import until_it_shows
     from cosim.cli.execute_run import run_processes
-    from cosim.cli.played_pattern import until_it_shows
 
     with status("trying how long the pattern must be played until its growth shows"):
         played = until_it_shows(

@@ -16,7 +16,7 @@ from rich.progress import (
 )
 from rich.progress import Progress as RichProgress
 
-from cosim.live.monitoring.line_times import begin_work, note_line, until_line_s
+from cosim.live.monitoring.progress_lines import begin_work, note_line, until_line_s
 from netem.core.command_line import print_to_stderr
 from netem.core.console import SafeConsole
 from noack.core.progress import Progress

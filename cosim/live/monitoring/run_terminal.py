@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from cosim.live.coordination.remote_access import ListenSettings
-from cosim.live.monitoring.line_times import begin_work, note_line, until_line_s
+from cosim.live.monitoring.progress_lines import begin_work, note_line, until_line_s
 from cosim.live.monitoring.run_observers import RunObserver
 from netem.core.address import address_text
 from noack.runtime.control_messages import RunProgress

@@ -1,6 +1,6 @@
 """The processes that a launcher starts: start, exit status, reason of a failure, end.
 
-They are forked from a process that has imported what they need (``preloaded.py``): of a command, as
+They are forked from a process that has imported what they need (``process_imports.py``): of a command, as
 long as it has one thread, from the command itself; of a program that uses the library, which may
 have threads, from Python's fork server, which remains for later runs.
 
@@ -38,7 +38,7 @@ MODULES = {
     "sensor": "sensor_node.__main__",
     "controller": "controller_node.__main__",
 }
-_PRELOADED = "cosim.live.processes.preloaded"
+_PRELOADED = "cosim.live.processes.process_imports"
 _MALLOPT = {-8: 2, -3: 131_072, -1: 131_072}
 """M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD of glibc: a process returns memory to the system
 after a busy moment. Otherwise glibc raises these thresholds with each large block, and keeps an arena

@@ -67,7 +67,7 @@ launcher._Run.watch = show
 main()
 """
 _PROCESSES = """
-import cosim.live.processes.preloaded
+import cosim.live.processes.process_imports
 show()
 """
 

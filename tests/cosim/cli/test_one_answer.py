@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 import noack
+from cosim.cli.destabilising_run import GROWN, until_it_shows
 from cosim.cli.options import load_scenario
-from cosim.cli.played_pattern import GROWN, until_it_shows
 from netem.output.result_tables import Tone
 from tests.helpers.command_line import invoke
 

@@ -24,8 +24,8 @@ from netem.core.clock import NS_PER_S
 from netem.core.errors import CallerError, MachineError, NoackError
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.runtime.control_messages import ClockError
-from noack.runtime.kept_rows import KeptFile, KeptHead
 from noack.runtime.spool import writer_of
+from noack.runtime.unsent_rows_file import KeptFile, KeptHead
 from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import validate

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 
 import pytest
 
-from cosim.live.monitoring import line_times, progress
+from cosim.live.monitoring import progress, progress_lines
 
 MOST_S = 60.0
 
@@ -27,7 +27,7 @@ def test_long_work_is_not_silent_though_it_reports_nothing(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(line_times, "LINE_EVERY_S", 0.01)
+    monkeypatch.setattr(progress_lines, "LINE_EVERY_S", 0.01)
     printed, ends_s = "", time.monotonic() + MOST_S
     begin, text = work
     with begin():
@@ -39,12 +39,12 @@ def test_long_work_is_not_silent_though_it_reports_nothing(
 
 def test_the_first_line_of_a_command_is_due_earlier(monkeypatch: pytest.MonkeyPatch) -> None:
     """The imports before the command's start count for who waits, too."""
-    monkeypatch.setattr(line_times, "LINE_EVERY_S", 2000.0)
-    monkeypatch.setattr(line_times, "FIRST_LINE_S", 1000.0)
-    with line_times.lines_of_command():
-        assert 0 < line_times.until_line_s() <= 1000.0
-        line_times.note_line()
-        assert 1000.0 < line_times.until_line_s() <= 2000.0
+    monkeypatch.setattr(progress_lines, "LINE_EVERY_S", 2000.0)
+    monkeypatch.setattr(progress_lines, "FIRST_LINE_S", 1000.0)
+    with progress_lines.lines_of_command():
+        assert 0 < progress_lines.until_line_s() <= 1000.0
+        progress_lines.note_line()
+        assert 1000.0 < progress_lines.until_line_s() <= 2000.0
 
 
 @pytest.mark.parametrize("is_command", [True, False])
@@ -52,9 +52,9 @@ def test_short_works_of_a_command_that_follow_each_other_are_not_silent_for_long
     is_command: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The last line was long ago when this work begins; in other programs this does not count."""
-    monkeypatch.setattr(line_times, "LINE_EVERY_S", 1000.0)
-    with line_times.lines_of_command() if is_command else nullcontext():
-        monkeypatch.setattr(line_times, "_last_s", time.monotonic() - 1000.0)
+    monkeypatch.setattr(progress_lines, "LINE_EVERY_S", 1000.0)
+    with progress_lines.lines_of_command() if is_command else nullcontext():
+        monkeypatch.setattr(progress_lines, "_last_s", time.monotonic() - 1000.0)
         printed, ends_s = "", time.monotonic() + (MOST_S if is_command else 0.5)
         with progress.activity("checking"):
             while "\n" not in printed and time.monotonic() < ends_s:
@@ -66,7 +66,7 @@ def test_short_works_of_a_command_that_follow_each_other_are_not_silent_for_long
 
 
 def test_the_share_is_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(line_times, "LINE_EVERY_S", 0.01)
+    monkeypatch.setattr(progress_lines, "LINE_EVERY_S", 0.01)
     printed, ends_s = "", time.monotonic() + MOST_S
     with progress.work_bar("proving", lines=True) as show:
         show(1.0, 4.0)
@@ -79,7 +79,7 @@ def test_the_share_is_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
 def test_work_within_other_work_prints_alone(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(line_times, "LINE_EVERY_S", 0.01)
+    monkeypatch.setattr(progress_lines, "LINE_EVERY_S", 0.01)
     printed, ends_s = "", time.monotonic() + MOST_S
     with progress.activity("outer"), progress.work_bar("inner", lines=True):
         capsys.readouterr()

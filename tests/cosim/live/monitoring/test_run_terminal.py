@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from cosim.live.monitoring import line_times, run_terminal
+from cosim.live.monitoring import progress_lines, run_terminal
 from noack.runtime.control_messages import RunProgress
 from tests.helpers.shipped import shipped
 
@@ -14,7 +14,7 @@ from tests.helpers.shipped import shipped
 def test_a_long_run_prints_lines_without_a_terminal(
     monkeypatch: pytest.MonkeyPatch, every_s: float, lines: int
 ) -> None:
-    monkeypatch.setattr(line_times, "LINE_EVERY_S", every_s)
+    monkeypatch.setattr(progress_lines, "LINE_EVERY_S", every_s)
     output = io.StringIO()
     terminal = run_terminal.RunTerminal(shipped("lane_following"), Console(file=output, width=500))
     for t_s in (1.0, 2.0):

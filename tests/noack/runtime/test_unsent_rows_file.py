@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.core.errors import NoackError
-from noack.runtime.kept_rows import KeptFile, KeptHead, read_kept
+from noack.runtime.unsent_rows_file import KeptFile, KeptHead, read_kept
 
 HEAD = KeptHead(run="0001", process="sensor", secret="s")
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from cosim.analysis.tried_settings import replaced
+from cosim.analysis.settings_with_certificates import replaced
 from cosim.analysis.witnesses import find_statement
 from netem.core.errors import NoackError
 from netem.core.number_format import at_most, to_digits
