@@ -20,7 +20,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     """The emulator and pytest, as `pip install noack-netem pytest` installs them, and the example."""
     place = tmp_path_factory.mktemp("user")
     wheels = [
-        wheel_of_sdist(ROOT / "netem", tmp_path_factory.mktemp("netem"), library="core"),
+        wheel_of_sdist(ROOT / "netem", tmp_path_factory.mktemp("netem"), "netem", "core"),
         built(EXAMPLES / "udp_ci", tmp_path_factory.mktemp("thermo"), "wheel"),
     ]
     return install(place, "noack-netem", wheels, also=("pytest", "pluggy", "iniconfig", "packaging"))
@@ -67,7 +67,7 @@ def test_the_image_of_the_emulator_is_small(environment: Installed, tmp_path: Pa
     builder = next((name for name in ("podman", "buildah", "docker") if shutil.which(name)), None)
     if builder is None or subprocess.run([builder, "info"], capture_output=True, check=False).returncode:
         pytest.skip("no builder of containers works here")
-    wheel = wheel_of_sdist(ROOT / "netem", tmp_path, library="core")
+    wheel = wheel_of_sdist(ROOT / "netem", tmp_path, "netem", "core")
     shutil.copyfile(ROOT / "netem" / "Containerfile", wheel.parent / "Containerfile")
     made = subprocess.run(
         [builder, "build", "--tag", "noack-netem-test", wheel.parent],
