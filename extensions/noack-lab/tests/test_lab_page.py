@@ -45,7 +45,7 @@ def test_dragging_changes_run_figure_and_text_and_is_compared_with_before(open_p
     scrolled = "[...document.querySelectorAll('.cm-line')].at(-1)?.scrollIntoView()"
     page.wait(f"({scrolled}, {TEXT}.includes('probability = 0.0'))")
     page.click("keep for comparison")
-    page.drag("maximum consecutive losses", 1.0)
+    page.drag("lost in a row, at most", 1.0)
     page.wait(f"{TEXT}.includes('the kept run')")
 
 
