@@ -1,6 +1,7 @@
 """The built and installed packages work without the repository."""
 
 import json
+import shutil
 import signal
 import subprocess
 import zipfile
@@ -153,6 +154,20 @@ def test_the_emulator_alone_is_a_fixture_of_pytest(netem: Installed) -> None:
     (netem.folder / "test_server.py").write_text(TEST)
     done = netem.run(netem.python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_server.py")
     assert (done.returncode, "1 passed" in done.stdout) == (0, True), done.stdout
+
+
+def test_the_emulator_alone_is_a_shell(netem: Installed) -> None:
+    """A datagram of the command passes the relay; `loss 100% mansd 0` loses none."""
+    isolated = ["unshare", "--user", "--map-root-user", "--net", "true"]
+    if not (shutil.which("ip") and shutil.which("unshare") and Path("/dev/net/tun").exists()):
+        pytest.skip("a shell needs ip, unshare and /dev/net/tun")
+    if subprocess.run(isolated, check=False).returncode:
+        pytest.skip("there are no namespaces of users here")
+    send = "import socket; socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'x', ('198.18.16.1', 9))"
+    done = netem("shell", "--json", "loss", "100%", "mansd", "0", "--", netem.python, "-c", send)
+    assert done.returncode == 0, done.stderr
+    forward = json.loads(done.stdout)["links"][0]["forward"]
+    assert forward["forwarded"] == forward["received"] >= 1
 
 
 def test_the_emulator_alone_says_what_predictions_need(netem: Installed) -> None:
