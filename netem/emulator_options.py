@@ -164,7 +164,7 @@ def shell_parser() -> Parser:
         prog=f"{netem_program()} shell",
         usage="%(prog)s [WORDS ...] [options] [-- COMMAND]",
         description="Run a command (without one: your shell) in a network namespace, and pass all "
-        f"its IP packets through an emulated network. The words are those of `{netem_program()}`. "
+        f"its IP packets through an emulated network. The words are the same as for `{netem_program()}`. "
         "With mansd N, at most N consecutive packets of a flow (protocol, addresses and ports) "
         "are lost. It needs no root if the kernel permits user namespaces.",
         epilog=_SHELL_EPILOG.format(program=netem_program()),

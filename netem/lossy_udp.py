@@ -54,8 +54,8 @@ class LossyUdp:
         seed: seed of the random streams.
         listen: where clients send to; port 0 selects a free port.
         name: name of the link in reports.
-        timetable: a CSV file with changes of the settings, in seconds since the start, as that of
-            ``noack-netem --timetable``.
+        timetable: a CSV file with changes of the settings, in seconds since the start; ``noack-netem
+            --timetable`` takes the same file.
         repeat_s: the timetable repeats after this time in seconds; by default it does not.
 
     Raises:

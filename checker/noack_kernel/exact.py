@@ -256,9 +256,10 @@ def exponential(F: Matrix, seconds: arb) -> arb_mat:
 
 
 def power(M: arb_mat, exponent: int) -> arb_mat:
-    """Return balls around each product of so many matrices that are within M and may differ.
+    """Return balls around each product of n matrices within M, which may differ; n is ``exponent``.
 
-    flint squares a matrix by other rules than it multiplies two: its balls are those of M M with the same M.
+    flint squares a matrix by a rule of its own: the balls of M² contain A² for each A within M, but not each
+    product A B.
     """
     found, factor = arb_mat(unit_rows(range(M.nrows()), M.nrows()).mid), M
     while exponent:

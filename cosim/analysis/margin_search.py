@@ -130,7 +130,7 @@ def undecided_text(stability: Stability) -> str:
 
 
 class LossCap(NamedTuple):
-    """A limit of the losses in a row, and what is known about the loop with it."""
+    """A limit of the losses in a row, with the stability of the loop under it."""
 
     mansd: int
     """At most this number of packets is lost in a row."""
@@ -240,7 +240,7 @@ class MarginResult:
 
     @property
     def stable_mansd(self) -> int | None:
-        """The largest number of losses in a row of which every pattern is stable; None: not even 0."""
+        """The largest number of losses in a row with which every pattern is stable; None: not even 0."""
         stable = [cap.mansd for cap in self.caps if cap.stability.verdict == "stable"]
         return max(stable, default=None)
 

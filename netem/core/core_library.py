@@ -42,8 +42,8 @@ class CoreLibrary:
     """A library in C, with the declarations of its public headers.
 
     Args:
-        path: the library; its name is that of the file without ``lib`` and ``.so``.
-        ffi: the declarations, and those that they include.
+        path: the library; its name is the file's without ``lib`` and ``.so``.
+        ffi: the declarations, included ones too.
         sources: digest of the sources of the declarations.
 
     Raises:
@@ -90,7 +90,7 @@ class CoreLibrary:
 
         Args:
             kind: what it is, e.g. ``"link"``.
-            arguments: those of its function ``noack_KIND_new``.
+            arguments: for its function ``noack_KIND_new``.
 
         Raises:
             ValueError: the core refuses the arguments; the text says why.

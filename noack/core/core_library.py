@@ -1,8 +1,8 @@
 """The loop's library in C (native/): its functions and handles. See :mod:`netem.core.core_library`.
 
-Its declarations have the types of the network's, but not its functions. Handles of the network, as
-that of a link, are made by the network's library, and may be given to functions of this one: it has a
-copy of the network's code, from the same sources.
+Its declarations include the network's types, not the network's functions. A handle of the network, such as a
+link, is made by the network's library, and may be given to functions of this library: it has a copy of the
+network's code, from the same sources.
 """
 
 from pathlib import Path

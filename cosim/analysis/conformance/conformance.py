@@ -257,8 +257,8 @@ class _Checked:
     ) -> Flags:
         """Return which rests are Σ column p with p in its range, but for what is ``free``.
 
-        What a signal that varies has more or less than a constant one is free, too. Signals are found by
-        projections in turn, on those that explain the rest and on those within their ranges.
+        A signal that varies may differ from a constant one: this difference is free, too. Signals are found
+        by projections in turn, on all signals that explain the rest and on all signals within their ranges.
         """
         columns, varied = flow.signals[states], flow.varied[states]
         if not columns.shape[1]:

@@ -151,7 +151,7 @@ class NetworkSearch:
         return QuickLoop((plant.A, plant.B, gain, H), self._times, self.weights, self._latest)
 
     def _new_graph(self, mansd: int) -> PatternGraph:
-        """Return the loss patterns of a limit, which keep those that were the worst."""
+        """Return the loss patterns of a limit; the graph keeps the worst patterns that it has met."""
         return PatternGraph(list_bursts(self.guarantee(mansd), self._loop.times, self._loop.between))
 
     def growth(self, K: MatrixRows, mansd: int) -> float:

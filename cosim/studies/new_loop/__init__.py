@@ -3,7 +3,9 @@
 ``plant_reference.py`` reads which plant is meant, ``linear_model.py`` has its linear model and gain.
 ``new_scenario.py`` leads from there to the scenario: ``choices.py`` has what the user chose, ``trials.py``
 the loops that are tried, ``choose.py`` takes the one with proven bounds, ``trial_scenario.py`` has its
-settings, ``scenario_text.py`` and ``notes.py`` what is written of them. What is chosen unless it is given:
+settings, ``scenario_text.py`` and ``notes.py`` the texts about them.
+
+These values are chosen unless they are given:
 """
 
 BETA_SHARE = 0.1

@@ -39,7 +39,7 @@ from noack.theory.witnesses.effort import MOST_WORK
 from noack.trigger_policies.decaying import DecayingSettings
 
 Report = Callable[[str], None]
-"""Called with what is being done."""
+"""Called with the present step, in words."""
 _LOOSE_BOUND_RATIO = 200.0
 """A bound of ‖x‖ above this multiple of ‖x(0)‖ is used only if there is no other."""
 
@@ -194,7 +194,7 @@ def _with_proof(
 
 
 def _easier_trials(choices: Choices, trial: LoopTrial) -> Iterator[LoopTrial]:
-    """Yield trials of which more is proven: with a smaller or slower threshold, and fewer losses."""
+    """Yield trials that are easier to prove: with a smaller or slower threshold, and fewer losses."""
     used = scenario_of(choices, trial).trigger
     if isinstance(used, DecayingSettings) and not trial.has_friction and not choices.is_linear:
         trial = replace(trial, floor=to_digits(SMALL_FLOOR_SHARE * used.beta, 2))

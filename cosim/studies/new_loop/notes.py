@@ -1,4 +1,4 @@
-"""What was chosen for a new loop, and what is known of it, in sentences."""
+"""Sentences about a new loop: its settings, its guarantee, its simulation."""
 
 from collections.abc import Iterator
 

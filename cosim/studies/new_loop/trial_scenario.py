@@ -75,8 +75,8 @@ def content_of(choices: Choices, trial: LoopTrial) -> Table:
 def _horizon_and_speed(trial: LoopTrial) -> tuple[float, float]:
     """Return how long a run lasts, in s, and the simulated time per wall time of a live run.
 
-    At the end the threshold has decayed, and what is guaranteed has begun for a while. A run of less than
-    4.6 s would show little; a live run takes some 20 s. The largest of both are those of a scenario.
+    At the end the threshold has decayed, and the guarantee has held for a while. A run of less than 4.6 s
+    would show little; a live run takes some 20 s. A scenario has at most 1e7 s, and a speed of 1000.
     """
     decayed_s = math.log(1 / HORIZON_DECAY) / trial.alpha_per_s
     horizon_s = min(to_digits(max(decayed_s, 1.2 * trial.guaranteed_from_s, 4.6)), 1e7)

@@ -44,7 +44,7 @@ class LoopTrial:
 def list_trials(
     model: LinearModel | LoopGain, x0: Vector, allowed: Mapping[str, float]
 ) -> Iterator[LoopTrial]:
-    """Yield what is tried, the preferred settings first; states without an allowed error may move.
+    """Yield the trials, the preferred settings first; states without an allowed error may move.
 
     Raises:
         CallerError: no gain makes the loop fast enough for a simulation of its fastest eigenvalue.
@@ -78,7 +78,7 @@ _FRICTION_INPUT_WEIGHTS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4)
 
 
 def _gains(model: LinearModel, x0: Vector, allowed: Mapping[str, float]) -> list[LoopGain]:
-    """Return the gains that are tried; with allowed errors and friction, those that are stiff enough."""
+    """Return the gains that are tried; with allowed errors and friction, only stiff enough gains."""
     q = state_weights(model, allowed)
     if not (allowed and model.source == "beside"):
         return [gain(model, q=q, r=r) for r in _INPUT_WEIGHTS]
